@@ -1,0 +1,55 @@
+"""Rigid transforms T (4 4): frames cancel from right to left, ``p_cam = T_cam_obj @ p_obj``. Lengths are mm."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+
+def rigid(R: Float[np.ndarray, "*n 3 3"], t: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:
+    """T (4 4) of rotations and translations."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def inverse(T: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
+    """T_b_a of T_a_b, exact for orthonormal rotations."""
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    return rigid(R, -(R @ T[..., :3, 3:])[..., 0])
+
+
+def transform(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 3"]:
+    """Points (m 3) in the frame on the left of T."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def nearest_rotation(R: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """The rotation closest in Frobenius norm (Kabsch), determinant +1."""
+    U, _, Vt = np.linalg.svd(R)
+    sign = np.linalg.det(U @ Vt)
+    U = U.copy()
+    U[..., :, -1] *= sign[..., None]
+    return U @ Vt
+
+
+def rotation_angle_deg(R_a: Float[np.ndarray, "*n 3 3"], R_b: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """Geodesic angle between rotations, degrees. Stable near 0 and 180: atan2 of sine and cosine."""
+    D = np.swapaxes(R_a, -1, -2) @ R_b
+    cos = (np.trace(D, axis1=-2, axis2=-1) - 1) / 2
+    axis = np.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
+    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=-1) / 2, cos))
+
+
+def look_at(eye: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:
+    """T_cam_obj of cameras at ``eye`` (object frame, mm) that look at the object's origin.
+
+    OpenCV camera: x right, y down, z forward; the object's z axis points up in the image. From straight above or
+    below, where "up" is undefined, the object's y axis does.
+    """
+    z = -eye / np.linalg.norm(eye, axis=-1, keepdims=True)
+    up = np.where(np.abs(z[..., 2:]) > 1 - 1e-9, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    R = np.stack([x, np.cross(z, x), z], axis=-2)
+    return rigid(R, -(R @ eye[..., None])[..., 0])

@@ -1,0 +1,36 @@
+"""Feature maps of crops, by decoder layer, and the fused maps of a query and its template."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+FeatureMaps = Mapping[int, Float[Tensor, "n c h w"]]
+"""layer -> maps of n crops; the map of layer l covers the whole crop with h x w equal cells."""
+
+
+@dataclass(frozen=True, eq=False)
+class FusedPair:
+    """Query and template in one feature space, at the resolution of the finest layer.
+
+    ``note`` says what was clamped or skipped, "" when nothing was.
+    """
+
+    query: Float[Tensor, "d h w"]
+    template: Float[Tensor, "d h w"]
+    query_mask: Bool[Tensor, "h w"]
+    template_mask: Bool[Tensor, "h w"]
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Cluster of each foreground cell (-1: background) in query and template, and which clusters correspond."""
+
+    query_label: Int[Tensor, "h w"]
+    template_label: Int[Tensor, "h w"]
+    pairs: Int[Tensor, "p 2"]
+    note: str = ""

@@ -1,0 +1,27 @@
+"""Matches: which template, and which of its points lie where in the query."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateMatch:
+    """The k best templates, best first. ``margin``: best score minus the best score outside the k kept (0 if none)."""
+
+    index: Int[Tensor, " k"]
+    score: Float[Tensor, " k"]
+    margin: float
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """m pairs of points in crop pixels (x, y), with cosine similarity and the index of their cluster pair."""
+
+    query_px: Float[Tensor, "m 2"]
+    template_px: Float[Tensor, "m 2"]
+    similarity: Float[Tensor, " m"]
+    cluster: Int[Tensor, " m"]

@@ -1,0 +1,58 @@
+"""Poses: what a solver returns, and what the route answers for a detection."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolution:
+    """A solver's answer. ``reprojection_px``: root mean square over the inliers, in the query image."""
+
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    inliers: Bool[np.ndarray, " m"]
+    reprojection_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """The pose of one detection, mm. ``score`` orders estimates of one object in one image; higher is better.
+
+    ``template_margin``: how far the chosen templates stand out from the rest. ``fallback``: "" for a solved pose,
+    otherwise what stood in for it. ``notes``: what stages clamped or skipped. ``times_s``: seconds by stage.
+    """
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    detection_id: int
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    score: float
+    detection_score: float
+    template_id: int
+    template_score: float
+    template_margin: float
+    correspondences: int
+    inliers: int
+    reprojection_px: float
+    gt_id: int | None = None
+    fallback: str = ""
+    notes: tuple[str, ...] = ()
+    times_s: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class NoEstimate:
+    """Why a target has no pose: the stage that gave up and its reason. ``detection_id`` None: nothing was detected."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    stage: str
+    reason: str
+    detection_id: int | None = None
+    gt_id: int | None = None

@@ -1,0 +1,137 @@
+"""Specs say what is computed and enter every key; Runtime says how and enters none.
+
+A variant of a stage is a frozen, type-checked dataclass whose fields are its parameters::
+
+    @spec
+    class Cosine(Spec):
+        kind: ClassVar[str] = "match.cosine"
+        version: ClassVar[int] = 1
+        layer: int = 2
+
+``kind`` is ``<stage>.<file name>``; raise ``version`` whenever the same fields give other results.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from hashlib import sha256
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
+
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from pipeline.errors import BadInput
+
+T = TypeVar("T")
+
+Positive = Annotated[int, Field(ge=1)]
+NonNegative = Annotated[int, Field(ge=0)]
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def spec(cls: type[T]) -> type[T]:
+    """Frozen, keyword-only dataclass whose fields are checked strictly (no "1" for 1, no True for 1)."""
+    config = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+    return checked_dataclass(frozen=True, kw_only=True, config=config)(cls)
+
+
+class Spec:
+    """Base of every spec. See the module's text."""
+
+    kind: ClassVar[str]
+    version: ClassVar[int] = 1
+
+    def recipe(self) -> dict[str, Any]:
+        """Everything the result depends on but the inputs, as JSON-able values.
+
+        A field that is a location on disk is replaced here, by its owner, with the digest of what lies there.
+        """
+        return {"kind": self.kind, "version": self.version} | {
+            f.name: _plain(getattr(self, f.name))
+            for f in fields(self)  # type: ignore[arg-type]
+        }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Spec):
+        return value.recipe()
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, (tuple, list)):
+        return [_plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    return value
+
+
+def canonical(value: Any) -> str:
+    """The one text of a JSON-able value: sorted keys, no spaces, no NaN. 1, 1.0, True and "1" differ."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+
+
+def digest(value: Any) -> str:
+    """sha256 (hex) of the canonical text of a JSON-able value."""
+    return sha256(canonical(value).encode()).hexdigest()
+
+
+def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
+    """The spec ``cls`` from configuration values (lists become tuples).
+
+    Raises BadInput naming ``where.field``, what was found and what is needed; several mistakes give the first.
+    """
+    try:
+        return cls(**{k: _tuples(v) for k, v in values.items()})
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join([where, *(str(p) for p in first["loc"])])
+        if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            known = ", ".join(f.name for f in fields(cls))  # type: ignore[arg-type]
+            raise BadInput(field, found="an unknown field", needed=f"one of: {known}") from None
+        message = first["msg"].removeprefix("Value error, ")
+        needed = message[0].lower() + message[1:].removeprefix("nput should be ")
+        needed = needed.removeprefix("i") if message.startswith("Input should be ") else needed
+        raise BadInput(field, found=repr(first["input"]), needed=needed) from None
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return tuple(_tuples(v) for v in value)
+    if isinstance(value, Mapping):
+        return {k: _tuples(v) for k, v in value.items()}
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Runtime:
+    """How to compute: never part of a key, never a reason for other results.
+
+    ``device`` is "auto", "cpu", "cuda" or "cuda:N"; ``batch`` the images per backbone pass, 0 = sized to memory.
+    """
+
+    device: str = "auto"
+    batch: int = 0
+    workers: int = 0
+    progress: bool = True
+
+    def torch_device(self) -> str:
+        """"auto" resolved. Raises BadInput when CUDA is asked for and absent."""
+        import torch
+
+        if self.device == "auto":
+            return "cuda" if torch.cuda.is_available() else "cpu"
+        if self.device.startswith("cuda") and not torch.cuda.is_available():
+            raise BadInput("runtime.device", found=repr(self.device), needed="a CUDA device, and torch sees none")
+        return self.device
+
+
+def finite(value: float) -> bool:
+    """True for a number that can stand in JSON."""
+    return math.isfinite(value)
+
+
+Dtype = Literal["float32", "float16", "bfloat16"]
