@@ -14,7 +14,6 @@ A variant of a stage is a frozen, type-checked dataclass whose fields are its pa
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from hashlib import sha256
@@ -115,11 +114,10 @@ class Runtime:
 
     device: str = "auto"
     batch: int = 0
-    workers: int = 0
     progress: bool = True
 
     def torch_device(self) -> str:
-        """"auto" resolved. Raises BadInput when CUDA is asked for and absent."""
+        """ "auto" resolved. Raises BadInput when CUDA is asked for and absent."""
         import torch
 
         if self.device == "auto":
@@ -127,11 +125,6 @@ class Runtime:
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise BadInput("runtime.device", found=repr(self.device), needed="a CUDA device, and torch sees none")
         return self.device
-
-
-def finite(value: float) -> bool:
-    """True for a number that can stand in JSON."""
-    return math.isfinite(value)
 
 
 Dtype = Literal["float32", "float16", "bfloat16"]

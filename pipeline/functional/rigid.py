@@ -53,3 +53,11 @@ def look_at(eye: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
     R = np.stack([x, np.cross(z, x), z], axis=-2)
     return rigid(R, -(R @ eye[..., None])[..., 0])
+
+
+def rotation_between(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that turns direction ``a`` into direction ``b`` (Rodrigues; not for opposite directions)."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    v = np.cross(a, b)
+    V = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.eye(3) + V + V @ V / (1.0 + a @ b)

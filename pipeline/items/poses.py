@@ -24,6 +24,7 @@ class PoseEstimate:
 
     ``template_margin``: how far the chosen templates stand out from the rest. ``fallback``: "" for a solved pose,
     otherwise what stood in for it. ``notes``: what stages clamped or skipped. ``times_s``: seconds by stage.
+    ``detection_id`` counts the detections of this object in this image; ``reprojection_px`` is None for a fallback.
     """
 
     scene_id: int
@@ -38,7 +39,7 @@ class PoseEstimate:
     template_margin: float
     correspondences: int
     inliers: int
-    reprojection_px: float
+    reprojection_px: float | None
     gt_id: int | None = None
     fallback: str = ""
     notes: tuple[str, ...] = ()

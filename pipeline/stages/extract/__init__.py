@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
@@ -23,10 +23,12 @@ class Backbone(Protocol):
 class Extractor(Protocol):
     """What an extract variant is: a spec that can say what it would give before any weight is loaded.
 
-    ``needs_geometry``: True only for oracles; their crops carry Geometry.
+    ``needs_geometry``: True only for oracles; their crops carry Geometry. ``notice``: what a user must know of the
+    features before trusting a number ("" when there is nothing), printed at the head of every run.
     """
 
-    needs_geometry: bool
+    needs_geometry: ClassVar[bool]
+    notice: ClassVar[str]
 
     @property
     def model(self) -> str:

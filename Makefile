@@ -1,0 +1,56 @@
+# Set-up is part of every target: a virtual environment of its own (.venv) unless one is active.
+# make help lists the targets.
+
+PYTHON ?= python3
+TORCH  ?= torch==2.13.0
+VENV   := $(or $(VIRTUAL_ENV),.venv)
+PY     := $(VENV)/bin/python
+STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
+ARGS   ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup gl demo test test-fast lint clean
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+setup: $(STAMP) ## the virtual environment and everything in it
+
+$(VENV)/bin/python:
+	@echo "[setup] no virtual environment is active: making $(VENV) with $(PYTHON)"
+	@$(PYTHON) -c 'import sys; ok = (3, 11) <= sys.version_info[:2] <= (3, 13); sys.exit(0 if ok else "needs Python 3.11 to 3.13, found " + sys.version.split()[0] + ": set PYTHON=...")'
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "[setup] python's venv module is missing (Debian: apt-get install python3-venv)" >&2; exit 1; }
+
+$(STAMP): pyproject.toml | $(VENV)/bin/python
+	@echo "[setup] installing $(TORCH) (set TORCH=... for another build)"
+	@$(PY) -m pip install --quiet "$(TORCH)"
+	@echo "[setup] installing dzop and what it needs"
+	@$(PY) -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+gl: ## EGL for render=pyrender (render=raycast needs no system package)
+	@if ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1'; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "[setup] installing EGL for pyrender: libegl1 libgl1-mesa-dri"; \
+		apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq libegl1 libgl1-mesa-dri >/dev/null; \
+	else \
+		echo "[setup] no EGL: pyrender's tests are skipped. To have them: sudo apt-get install libegl1 libgl1-mesa-dri"; \
+	fi
+
+demo: $(STAMP) ## poses of procedural objects in cluttered scenes, with errors against the exact ground truth
+	$(PY) -m pipeline dataset=demo $(ARGS)
+
+test: $(STAMP) gl ## the whole test suite
+	PYOPENGL_PLATFORM=egl $(PY) -m pytest $(ARGS)
+
+test-fast: $(STAMP) ## the tests that take less than 20 seconds each
+	$(PY) -m pytest -m "not slow" $(ARGS)
+
+lint: $(STAMP) ## style, types, import contracts
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+	$(VENV)/bin/lint-imports
+
+clean: ## remove results and caches of tools; the feature store in cache/ stays
+	rm -rf results .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist

@@ -1,0 +1,103 @@
+"""The command line: configuration -> a run. The only module that knows Hydra.
+
+``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache ...`` looks after the store.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from pipeline.cache_cli import cache_command
+from pipeline.errors import BadInput, DzopError
+from pipeline.route import Stages
+from pipeline.run import Options, Select, run
+from pipeline.spec import Runtime, build
+from pipeline.store import Store
+
+STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "detect")
+PACKAGE = Path(__file__).resolve().parent
+CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
+
+
+def main() -> None:
+    """Run, and turn whatever a user can mend into one line on stderr and exit status 1."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing a paragraph; the line below is the message
+    try:
+        if sys.argv[1:2] == ["cache"]:
+            cache_command(sys.argv[2:])
+        else:
+            _hydra_main()
+    except (DzopError, HydraException, OmegaConfBaseException) as error:
+        sys.exit(f"error: {_one_line(error)}")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of a pipe has left: not a fault
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit("interrupted: what was complete is kept, and the next run goes on from there")
+
+
+@hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
+def _hydra_main(config: DictConfig) -> None:
+    # one plain dict, so that nothing below knows OmegaConf
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    run(
+        stages=stages_of(values),
+        dataset=variant(values["dataset"], "dataset"),
+        store=Store(variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),
+        runtime=build(Runtime, values["runtime"], where="runtime"),
+        options=options_of(values),
+    )
+
+
+def stages_of(values: Mapping[str, Any]) -> Stages:
+    """The stages a configuration chooses."""
+    chosen = {name: variant(values[name], name) for name in STAGES}
+    if not isinstance(values["fallback"], bool):
+        raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
+    return Stages(**chosen, fallback=values["fallback"])
+
+
+def options_of(values: Mapping[str, Any]) -> Options:
+    """What to run and where to write, from a configuration."""
+    names = ("step", "plan", "out", "overlays", "threads", "method")
+    select = build(Select, values["select"], where="select")
+    label = {stage: values[stage]["_target_"].rsplit(".", 2)[-2] for stage in STAGES}
+    return build(
+        Options,
+        {**{name: values[name] for name in names}, "select": select, "config": values, "label": label},
+        where="config",
+    )
+
+
+def variant(values: Mapping[str, Any], where: str) -> Any:
+    """The spec that ``_target_`` names, with its fields checked; ``auto`` variants answer with a concrete one."""
+    fields = dict(values)
+    target = fields.pop("_target_", None)
+    if not isinstance(target, str):
+        raise BadInput(f"{where}._target_", found=repr(target), needed="the import path of a class")
+    try:
+        cls = hydra.utils.get_class(target)
+    except (ImportError, ValueError, AttributeError) as error:
+        raise BadInput(
+            f"{where}._target_", found=f"{target!r} ({error})", needed="the import path of a class"
+        ) from None
+    chosen = build(cls, fields, where=where)
+    return chosen.resolve() if hasattr(chosen, "resolve") else chosen
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    main()

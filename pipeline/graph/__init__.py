@@ -1,0 +1,47 @@
+"""The cached graph: what every result is made from, and the only caller of the store.
+
+A node is an entry of the store. Its key follows from digests of files and from specs alone, so it is known before
+anything is computed: a plan costs nothing, a step runs only what is missing, and a sweep over a matching parameter
+touches no template and no backbone.
+
+mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
+image, detections -> query crops -> query features (by timestep and layer)          queries.py
+template features, query features, stages -> poses (by scene and object) -> run     poses.py
+"""
+
+from __future__ import annotations
+
+from pipeline.graph.context import Context
+from pipeline.graph.plan import Node, Plan
+from pipeline.graph.poses import PoseNodes
+from pipeline.graph.queries import QueryNodes
+from pipeline.graph.templates import TemplateNodes
+from pipeline.items.records import Answer
+
+
+class Graph:
+    """All nodes of one run."""
+
+    def __init__(self, run: Context) -> None:
+        self.run = run
+        self.templates = TemplateNodes(run)
+        self.queries = QueryNodes(run)
+        self.poses = PoseNodes(run, self.templates, self.queries)
+
+    def onboard(self) -> None:
+        """Everything offline, for every object of the targets."""
+        for obj_id in self.run.object_ids:
+            self.templates.onboard(obj_id)
+
+    def detect(self) -> int:
+        """Detections of all targets; returns how many."""
+        return len(self.queries.detections)
+
+    def estimate(self) -> list[Answer]:
+        """An answer for every detection of every target, and for every target without one."""
+        self.onboard()
+        return self.poses.estimate()
+
+    def plan(self) -> list[Node]:
+        """Every node with its state, key, size and cost."""
+        return Plan(self.run, self.templates, self.queries, self.poses).nodes()

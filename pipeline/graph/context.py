@@ -1,0 +1,144 @@
+"""What every node needs: stages, dataset, store, the backbone loaded once, and the two ways to fill entries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from pipeline.bop.dataset import Dataset
+from pipeline.errors import DzopError
+from pipeline.items.objects import ObjectModel
+from pipeline.items.views import Crops, Target
+from pipeline.route import Stages
+from pipeline.spec import Runtime
+from pipeline.stages.extract import Backbone
+from pipeline.store import Layout, Ref, Store, make_ref
+from pipeline.tally import Tally
+
+ImageId = tuple[int, int]
+"""(scene_id, im_id)"""
+
+
+@dataclass(eq=False)
+class Context:
+    """One run: its stages, data, store and counts."""
+
+    stages: Stages
+    dataset: Dataset
+    targets: Sequence[Target]
+    store: Store
+    runtime: Runtime
+    tally: Tally = field(default_factory=Tally)
+
+    @cached_property
+    def object_ids(self) -> list[int]:
+        """Objects of the targets."""
+        return sorted({target.obj_id for target in self.targets})
+
+    @cached_property
+    def image_ids(self) -> list[ImageId]:
+        """Images of the targets."""
+        return sorted({(target.scene_id, target.im_id) for target in self.targets})
+
+    @cached_property
+    def model(self) -> Callable[[int], ObjectModel]:
+        """An object's mesh, read once."""
+        return lru_cache(maxsize=None)(self.dataset.object_model)
+
+    @cached_property
+    def backbone(self) -> Backbone:
+        """The extractor with its weights, loaded when the first feature is missing."""
+        return self.stages.extract.load(self.runtime)
+
+    @cached_property
+    def device(self) -> str:
+        """Where tensors live."""
+        return self.runtime.torch_device()
+
+    def K(self, image: ImageId) -> Float[np.ndarray, "3 3"]:
+        """Camera matrix of an image."""
+        return self.dataset.scene(image[0]).camera(image[1]).K
+
+    def tensor(self, values: np.ndarray) -> torch.Tensor:
+        """Stored values on the device."""
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    # --- entries of one kind -----------------------------------------------------------------------------------------
+
+    def features(self, layer: int, inputs: Mapping[str, str]) -> Ref:
+        """Features of one layer of some crops, at a path a person can read."""
+        extract = self.stages.extract
+        recipe = {"kind": "features", "extract": extract.recipe(), "layer": layer}
+        return make_ref(f"features/{extract.model}/t{extract.timestep}/layer{layer}", recipe, inputs)
+
+    def features_layout(self, layer: int) -> dict[str, Layout]:
+        """Arrays of a features entry."""
+        return {"maps": Layout(self.stages.extract.feature_shape(layer), "float16")}
+
+    def crops_layout(self) -> dict[str, Layout]:
+        """Arrays of a crops entry."""
+        size = self.stages.crop.size
+        return {
+            "rgb": Layout((size, size, 3), "uint8", compress=True),
+            "mask": Layout((size, size), "bool", compress=True),
+            "A_crop_img": Layout((3, 3), "float64"),
+        }
+
+    # --- filling -----------------------------------------------------------------------------------------------------
+
+    def fill(
+        self,
+        step: str,
+        title: str,
+        refs: Mapping[Ref, Mapping[str, Layout]],
+        rows: int,
+        batch: int,
+        compute: Callable[[list[int]], Any],
+        document: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Fill entries and count them, with a bar when the step has a title of its own."""
+        if all(self.store.complete(ref) for ref in refs):
+            self.tally.add(step, reused=rows)
+            return
+        progress = Tally(self.tally.progress and bool(title))
+        with progress.bar(rows, title, "row") as advance:
+            filled = self.store.fill(refs, rows=rows, batch=batch, compute=compute, document=document, progress=advance)
+        self.tally.add(step, computed=filled.computed, reused=filled.reused, time_s=filled.time_s)
+
+    def extract(
+        self, step: str, title: str, refs: Mapping[int, Ref], rows: int, crops: Callable[[list[int]], Crops]
+    ) -> None:
+        """Features of the layers that are missing, in as few passes as possible: one for all of them."""
+        missing = {layer: ref for layer, ref in refs.items() if not self.store.complete(ref)}
+        if not missing:
+            self.tally.add(step, reused=rows)
+            return
+
+        def compute(batch: list[int]) -> dict[str, dict[str, np.ndarray]]:
+            maps = self.backbone(crops(batch), tuple(missing))
+            return {ref.key: {"maps": _half(maps[layer], layer)} for layer, ref in missing.items()}
+
+        layouts = {ref: self.features_layout(layer) for layer, ref in missing.items()}
+        self.fill(step, title, layouts, rows, self.runtime.batch or self.backbone.batch, compute)
+
+
+def stacked(crops: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Rows of a crops entry from what the crop stage returns."""
+    rgb, mask, A_crop_img = (np.stack(parts) for parts in zip(*crops, strict=True))
+    return {"rgb": rgb, "mask": mask, "A_crop_img": A_crop_img}
+
+
+def _half(maps: torch.Tensor, layer: int) -> np.ndarray:
+    """float16 on the CPU. Raises DzopError where a value does not fit: infinite features would give wrong poses."""
+    half = maps.half()
+    if not torch.isfinite(half).all():
+        raise DzopError(
+            f"layer {layer}: features are not finite in float16; try extract.dtype=float32 or another layer"
+        )
+    return half.cpu().numpy()

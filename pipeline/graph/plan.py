@@ -1,0 +1,86 @@
+"""Every node of a run with its state, key, size and cost, before anything is spent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipeline.graph.context import Context, ImageId
+from pipeline.graph.poses import PoseNodes
+from pipeline.graph.queries import QueryNodes
+from pipeline.graph.templates import TemplateNodes
+from pipeline.store import Layout, Ref
+
+TEMPLATE_PIXEL_BYTES = 7  # rgb and float32 depth, before compression
+
+
+@dataclass(frozen=True)
+class Node:
+    """One entry as a plan shows it. ``cost``: views to render, images to pass through the backbone, poses to solve."""
+
+    step: str
+    of: str
+    ref: Ref
+    state: str
+    nbytes: int
+    cost: str
+
+
+@dataclass(eq=False)
+class Plan:
+    """Lists nodes. Detections are read from their files, since all that follows depends on them; nothing is stored."""
+
+    run: Context
+    templates: TemplateNodes
+    queries: QueryNodes
+    poses: PoseNodes
+
+    def nodes(self) -> list[Node]:
+        """All nodes in the order of the route."""
+        nodes = [node for obj_id in self.run.object_ids for node in self._of_object(obj_id)]
+        for image in self.run.image_ids:
+            nodes += self._of_image(image)
+        for group, targets in self.poses.groups.items():
+            of = f"scene {group[0]} object {group[1]}"
+            nodes.append(self._node("poses", of, self.poses.poses(group), 0, f"{len(targets)} targets"))
+        return nodes
+
+    def _of_object(self, obj_id: int) -> list[Node]:
+        _, T_cam_obj, (h, w) = self.run.stages.render.cameras(self.run.model(obj_id).mesh)
+        n, of = len(T_cam_obj), f"object {obj_id}"
+        size = n * (h * w * TEMPLATE_PIXEL_BYTES + T_cam_obj[0].nbytes)
+        nodes = [
+            self._node("templates", of, self.templates.templates(obj_id), size, f"{n} views"),
+            self._node(
+                "template crops", of, self.templates.crops(obj_id), _size(self.run.crops_layout(), n), f"{n} crops"
+            ),
+        ]
+        return nodes + [
+            self._features("template features", f"{of} layer {layer}", self.templates.features(obj_id, layer), layer, n)
+            for layer in self.run.stages.layers
+        ]
+
+    def _of_image(self, image: ImageId) -> list[Node]:
+        n, of = len(self.queries.of_image[image]), f"scene {image[0]} image {image[1]}"
+        nodes = [
+            self._node("query crops", of, self.queries.crops(image), _size(self.run.crops_layout(), n), f"{n} crops")
+        ]
+        return nodes + [
+            self._features("query features", f"{of} layer {layer}", self.queries.features(image, layer), layer, n)
+            for layer in self.run.stages.layers
+            if n
+        ]
+
+    def _features(self, step: str, of: str, ref: Ref, layer: int, rows: int) -> Node:
+        return self._node(
+            step, of, ref, _size(self.run.features_layout(layer), rows), f"{rows} images through the backbone"
+        )
+
+    def _node(self, step: str, of: str, ref: Ref, nbytes: int, cost: str) -> Node:
+        state = self.run.store.state(ref)
+        stored = self.run.store.size(ref)
+        return Node(step, of, ref, state, nbytes if stored is None else stored, "" if state == "cached" else cost)
+
+
+def _size(layouts: Mapping[str, Layout], rows: int) -> int:
+    return sum(layout.nbytes(rows) for layout in layouts.values())

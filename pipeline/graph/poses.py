@@ -1,0 +1,163 @@
+"""template features, query features, stages -> poses, by scene and object; and the whole run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+from pipeline.errors import NoPose
+from pipeline.graph.context import Context, ImageId
+from pipeline.graph.queries import Found, QueryNodes
+from pipeline.graph.templates import StoredBank, TemplateNodes
+from pipeline.items.poses import NoEstimate, PoseEstimate
+from pipeline.items.records import Answer, answer_of, detection_record, record_of
+from pipeline.items.views import Detection, Target
+from pipeline.route import Query, Trace, template_pose, trace_pose
+from pipeline.spec import digest
+from pipeline.store import Ref, make_ref
+
+POSES_VERSION = 1
+ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve")
+
+
+@dataclass(eq=False)
+class PoseNodes:
+    """Entries of poses. Methods without a verb name entries; ``estimate`` computes what is missing."""
+
+    run: Context
+    templates: TemplateNodes
+    queries: QueryNodes
+
+    @cached_property
+    def groups(self) -> dict[tuple[int, int], list[Target]]:
+        """Targets by scene and object: the poses of one group are one entry."""
+        grouped: dict[tuple[int, int], list[Target]] = {}
+        for target in self.run.targets:
+            grouped.setdefault((target.scene_id, target.obj_id), []).append(target)
+        return dict(sorted(grouped.items()))
+
+    @cached_property
+    def poses(self) -> Callable[[tuple[int, int]], Ref]:
+        """Poses of one object in one scene."""
+        return lru_cache(maxsize=None)(self._poses)
+
+    def _poses(self, group: tuple[int, int]) -> Ref:
+        stages, (_, obj_id) = self.run.stages, group
+        recipe = {"kind": "poses", "version": POSES_VERSION, "fallback": stages.fallback}
+        recipe |= {name: getattr(stages, name).recipe() for name in ONLINE_STAGES}
+        inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
+        for layer in stages.layers:
+            inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key
+        for target in self.groups[group]:
+            image = (target.scene_id, target.im_id)
+            asked = [target.inst_count, self.run.K(image).tolist()]
+            asked += [detection_record(d) for _, d in self._detections(target)]
+            features = [self.queries.features(image, layer).key for layer in stages.layers]
+            inputs[f"image {target.im_id}"] = digest([asked, self.queries.crops(image).key, features])
+        return make_ref("poses", recipe, inputs)
+
+    def run_ref(self) -> Ref:
+        """The whole run: all poses of all targets."""
+        return make_ref("runs", {"kind": "run"}, {f"{s}/{o}": self.poses((s, o)).key for s, o in self.groups})
+
+    def estimate(self) -> list[Answer]:
+        """An answer for every detection of every target and for every target without one."""
+        ref = self.run_ref()
+        if not self.run.store.complete(ref):
+            self._make(ref)
+        answers = [answer_of(record) for record in self.run.store.read(ref).document["answers"]]
+        self._count_reused(len(answers))
+        return answers
+
+    def _make(self, ref: Ref) -> None:
+        missing = [group for group in self.groups if not self.run.store.complete(self.poses(group))]
+        self._make_queries(sorted({(t.scene_id, t.im_id) for group in missing for t in self.groups[group]}))
+        total = sum(len(self.groups[group]) for group in missing)
+        with self.run.tally.bar(total, "poses", "target") as advance:
+            for group in sorted(missing, key=lambda group: group[1]):
+                self._make_poses(group, advance)
+        made = [self.run.store.read(self.poses(group)).document["answers"] for group in self.groups]
+        records = [record for answers in made for record in answers]
+        self.run.store.put_document(ref, {"answers": records}, rows=len(records))
+
+    def _make_queries(self, images: Sequence[ImageId]) -> None:
+        with self.run.tally.bar(len(images), "query features", "image") as advance:
+            for image in images:
+                self.queries.make_features(image, self.queries.make_crops(image))
+                advance(1)
+
+    def _count_reused(self, answers: int) -> None:
+        """Whatever this run stands on and did not compute was reused."""
+        usable = sum(len(found) for found in self.queries.of_image.values())
+        for step, rows in (("query crops", usable), ("query features", usable), ("poses", answers)):
+            count = self.run.tally.of(step)
+            self.run.tally.add(step, reused=max(0, rows - count.computed - count.reused))
+
+    def _make_poses(self, group: tuple[int, int], advance: Callable[[int], None]) -> None:
+        ref, (_, obj_id) = self.poses(group), group
+        bank = self.templates.bank(obj_id)
+        answers: list[Answer] = []
+        for target in self.groups[group]:
+            answers += self._answers(target, bank)
+            advance(1)
+        seconds = sum(sum(a.times_s.values()) for a in answers if isinstance(a, PoseEstimate))
+        document = {"answers": [record_of(answer) for answer in answers]}
+        self.run.store.put_document(ref, document, rows=len(answers), time_s=seconds)
+        self.run.tally.add("poses", computed=len(answers), time_s=seconds)
+
+    def _detections(self, target: Target) -> list[tuple[int, Detection]]:
+        return self.queries.of_target.get((target.scene_id, target.im_id, target.obj_id), [])
+
+    def _answers(self, target: Target, bank: StoredBank) -> list[Answer]:
+        """One answer for every detection of a target, or the one that says that there is no detection."""
+        cropped = {found.index: found for found in self.queries.found((target.scene_id, target.im_id))}
+        mine = self._detections(target)
+        if not mine:
+            reason = f"object {target.obj_id} was not detected in scene {target.scene_id}, image {target.im_id}"
+            return [NoEstimate(target.scene_id, target.im_id, target.obj_id, "detect", reason)]
+        return [self._answer(nth, index, d, cropped.get(index), bank) for nth, (index, d) in enumerate(mine)]
+
+    def _answer(self, nth: int, index: int, d: Detection, found: Found | None, bank: StoredBank) -> Answer:
+        try:
+            if d.defect is not None:
+                raise NoPose("detect", d.defect)
+            if found is None:
+                raise NoPose("crop", self.queries.crop_failure(index, d))
+            query, shared_s = self.queries.query(found)
+            trace = trace_pose(self.run.stages, query, bank)
+            return self._estimate(nth, d, query, trace, bank, shared_s)
+        except NoPose as failure:
+            return NoEstimate(d.scene_id, d.im_id, d.obj_id, failure.stage, failure.reason, nth, d.gt_id)
+
+    def _estimate(
+        self, nth: int, d: Detection, query: Query, trace: Trace, bank: StoredBank, shared_s: Mapping[str, float]
+    ) -> PoseEstimate:
+        best, matches = trace.best, trace.best.matches
+        if best.solution is not None:
+            T_cam_obj, fallback = best.solution.T_cam_obj, ""
+        elif self.run.stages.fallback:
+            T_cam_obj = template_pose(query, bank.view(best.template_id))
+            fallback = f"rotation of template {best.template_id}, scale of the crop ({best.failure})"
+        else:
+            raise best.failure or NoPose("solve", "no hypothesis")
+        count = 0 if matches is None else len(matches.similarity)
+        return PoseEstimate(
+            scene_id=d.scene_id,
+            im_id=d.im_id,
+            obj_id=d.obj_id,
+            detection_id=nth,
+            T_cam_obj=T_cam_obj,
+            score=d.score * best.inliers / max(count, 1),
+            detection_score=d.score,
+            template_id=best.template_id,
+            template_score=best.template_score,
+            template_margin=trace.match.margin,
+            correspondences=count,
+            inliers=best.inliers,
+            reprojection_px=best.solution.reprojection_px if best.solution else None,
+            gt_id=d.gt_id,
+            fallback=fallback,
+            notes=best.notes,
+            times_s={**shared_s, **trace.times_s},
+        )

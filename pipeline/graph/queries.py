@@ -1,0 +1,185 @@
+"""image -> detections -> query crops -> query features, once for every image; and queries read back from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from pipeline.bop.masks import decode
+from pipeline.digests import file_digest, files_digest
+from pipeline.errors import BadInput, NoPose
+from pipeline.functional.rigid import nearest_rotation, rigid
+from pipeline.graph.context import Context, ImageId, stacked
+from pipeline.items.records import detection_of, detection_record
+from pipeline.items.views import Crops, Detection, Geometry
+from pipeline.route import Query
+from pipeline.spec import digest
+from pipeline.stages.render.raycast import render_depth
+from pipeline.store import Ref, make_ref
+
+
+@dataclass(frozen=True)
+class Found:
+    """A usable detection: its index among all detections and its row among its image's query crops."""
+
+    index: int
+    row: int
+    detection: Detection
+
+
+@dataclass(eq=False)
+class QueryNodes:
+    """Entries of images. Methods without a verb name entries; ``make_*`` compute what is missing."""
+
+    run: Context
+
+    def detections_ref(self) -> Ref:
+        """All detections of the targets."""
+        root = self.run.dataset.root
+        sources = {
+            path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name: path
+            for path in self.run.stages.detect.sources(self.run.dataset, self.run.targets)
+        }
+        recipe = {"kind": "detections", "detect": self.run.stages.detect.recipe()}
+        asked = digest([[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.run.targets])
+        return make_ref("detections", recipe, {"sources": files_digest(sources), "targets": asked})
+
+    @cached_property
+    def detections(self) -> list[Detection]:
+        """Detections of the targets, made once."""
+        ref = self.detections_ref()
+        fresh = not self.run.store.complete(ref)
+        if fresh:
+            found = self.run.stages.detect(self.run.dataset, self.run.targets)
+            self.run.store.put_document(ref, [detection_record(d) for d in found], rows=len(found))
+        found = [detection_of(record) for record in self.run.store.read(ref).document]
+        self.run.tally.add("detections", **{"computed" if fresh else "reused": len(found)})
+        return found
+
+    @cached_property
+    def of_target(self) -> dict[tuple[int, int, int], list[tuple[int, Detection]]]:
+        """Detections of each (scene_id, im_id, obj_id) with their index among all, defective ones included."""
+        grouped: dict[tuple[int, int, int], list[tuple[int, Detection]]] = {}
+        for index, d in enumerate(self.detections):
+            grouped.setdefault((d.scene_id, d.im_id, d.obj_id), []).append((index, d))
+        return grouped
+
+    @cached_property
+    def of_image(self) -> dict[ImageId, list[tuple[int, Detection]]]:
+        """Usable detections of each image with their index, in order."""
+        grouped: dict[ImageId, list[tuple[int, Detection]]] = {image: [] for image in self.run.image_ids}
+        for index, detection in enumerate(self.detections):
+            if detection.defect is None:
+                grouped[detection.scene_id, detection.im_id].append((index, detection))
+        return grouped
+
+    @cached_property
+    def crops(self) -> Callable[[ImageId], Ref]:
+        """Crops of an image's detections."""
+        return lru_cache(maxsize=None)(self._crops)
+
+    def _crops(self, image: ImageId) -> Ref:
+        shown = [[d.obj_id, list(d.bbox_xyxy), d.rle] for _, d in self.of_image[image]]
+        recipe = {"kind": "query crops", "crop": self.run.stages.crop.recipe()}
+        inputs = {"image": file_digest(self.run.dataset.image_path(*image)), "detections": digest(shown)}
+        return make_ref("crops", recipe, inputs)
+
+    def features(self, image: ImageId, layer: int) -> Ref:
+        """Features of an image's detections, one layer."""
+        inputs = {"crops": self.crops(image).key}
+        if self.run.stages.extract.needs_geometry:
+            poses = [
+                [d.obj_id, self.run.model(d.obj_id).mesh.digest, self._true_pose(d).tolist()]
+                for _, d in self.of_image[image]
+            ]
+            inputs["geometry"] = digest([poses, self.run.K(image).tolist()])
+        return self.run.features(layer, inputs)
+
+    def make_crops(self, image: ImageId) -> list[Found]:
+        """Crop what is missing of an image's detections; those that cannot be cropped are left out, with their reason."""
+        ref = self.crops(image)
+        if self.run.store.complete(ref):
+            self.run.tally.add("query crops", reused=self.run.store.read(ref).rows)
+            return self.found(image)
+        crops, document = self._cropped(image)
+        if not crops:
+            self.run.store.put_document(ref, document, rows=0)
+            return []
+        arrays = stacked(crops)
+
+        def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
+            return {ref.key: {name: values[rows] for name, values in arrays.items()}}
+
+        self.run.fill("query crops", "", {ref: self.run.crops_layout()}, len(crops), len(crops), compute, document)
+        return self.found(image)
+
+    def _cropped(self, image: ImageId) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], dict[str, object]]:
+        """Crops, and which of the image's usable detections they are or why there is none."""
+        usable = self.of_image[image]
+        rgb = self.run.dataset.image(*image).rgb
+        crops, kept, failed = [], [], {}
+        for position, (_, detection) in enumerate(usable):
+            try:
+                mask = None if detection.rle is None else decode(detection.rle)
+                crops.append(self.run.stages.crop(rgb, mask, detection.bbox_xyxy))
+                kept.append(position)
+            except NoPose as failure:
+                failed[str(position)] = failure.reason
+        return crops, {"kept": kept, "failed": failed}
+
+    def found(self, image: ImageId) -> list[Found]:
+        """The detections of an image that have a crop."""
+        usable = self.of_image[image]
+        kept = self.run.store.read(self.crops(image)).document["kept"]
+        return [Found(usable[position][0], row, usable[position][1]) for row, position in enumerate(kept)]
+
+    def make_features(self, image: ImageId, found: Sequence[Found]) -> None:
+        """Extract what is missing of the features of an image's detections."""
+        if found:
+            refs = {layer: self.features(image, layer) for layer in self.run.stages.layers}
+            self.run.extract("query features", "", refs, len(found), lambda rows: self._crops_of(image, found, rows))
+
+    def _crops_of(self, image: ImageId, found: Sequence[Found], rows: Sequence[int]) -> Crops:
+        entry = self.run.store.read(self.crops(image))
+        geometry = None
+        if self.run.stages.extract.needs_geometry:
+            photo = self.run.dataset.image(*image)
+            poses = [self._true_pose(found[row].detection) for row in rows]
+            depth = [
+                render_depth(self.run.model(found[row].detection.obj_id).mesh, photo.K, T[None], photo.rgb.shape[:2])[0]
+                for row, T in zip(rows, poses, strict=True)
+            ]
+            geometry = Geometry(depth, np.repeat(photo.K[None], len(rows), 0), np.stack(poses))
+        return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
+
+    def _true_pose(self, detection: Detection) -> np.ndarray:
+        if detection.gt_id is None:
+            raise BadInput(
+                "extract=coordinates",
+                found="detections without ground truth",
+                needed="detect=gt_mask or detect=gt_bbox",
+            )
+        T = self.run.dataset.ground_truth(detection.scene_id, detection.im_id)[detection.gt_id].T_cam_obj
+        return rigid(nearest_rotation(T[:3, :3]), T[:3, 3])  # published rotations are rounded, rays need exact ones
+
+    def query(self, found: Found) -> tuple[Query, dict[str, float]]:
+        """A detection as the online route reads it, and its share of its image's seconds."""
+        image = (found.detection.scene_id, found.detection.im_id)
+        entries = {layer: self.run.store.read(self.features(image, layer)) for layer in self.run.stages.layers}
+        crops = self.run.store.read(self.crops(image))
+        maps = {layer: self.run.tensor(entry.array("maps", [found.row])[0]) for layer, entry in entries.items()}
+        mask, A_crop_img = crops.array("mask", [found.row])[0], crops.array("A_crop_img", [found.row])[0]
+        share = {
+            "crop": crops.time_s / crops.rows,
+            "extract": max(entry.time_s for entry in entries.values()) / crops.rows,
+        }
+        return Query(maps, self.run.tensor(mask), A_crop_img, self.run.K(image)), share
+
+    def crop_failure(self, index: int, d: Detection) -> str:
+        """Why a detection has no crop."""
+        image = (d.scene_id, d.im_id)
+        position = next(p for p, (i, _) in enumerate(self.of_image[image]) if i == index)
+        return str(self.run.store.read(self.crops(image)).document["failed"][str(position)])

@@ -1,0 +1,141 @@
+"""mesh -> templates -> template crops -> template features, once for every object; and the bank read back from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import torch
+
+from pipeline.errors import DzopError
+from pipeline.graph.context import Context, stacked
+from pipeline.items.views import Crops, Geometry, Templates
+from pipeline.route import TemplateView
+from pipeline.store import Layout, Ref, make_ref
+
+VIEWS_PER_BATCH = 8
+CROPS_PER_BATCH = 50
+
+
+@dataclass(eq=False)
+class StoredBank:
+    """One object's templates as the online route reads them; views are read one by one and the last few kept."""
+
+    features: torch.Tensor
+    mask: torch.Tensor
+    view: Callable[[int], TemplateView]
+
+
+@dataclass(eq=False)
+class TemplateNodes:
+    """Entries of objects. Methods without a verb name entries; ``make_*`` compute what is missing."""
+
+    run: Context
+
+    @cached_property
+    def templates(self) -> Callable[[int], Ref]:
+        """Rendered views of an object."""
+        return lru_cache(maxsize=None)(self._templates)
+
+    def _templates(self, obj_id: int) -> Ref:
+        recipe = {"kind": "templates", "render": self.run.stages.render.recipe()}
+        return make_ref("templates", recipe, {"mesh": self.run.model(obj_id).mesh.digest})
+
+    def crops(self, obj_id: int) -> Ref:
+        """Their crops."""
+        recipe = {"kind": "template crops", "crop": self.run.stages.crop.recipe()}
+        return make_ref("crops", recipe, {"templates": self.templates(obj_id).key})
+
+    def features(self, obj_id: int, layer: int) -> Ref:
+        """Their features of one layer."""
+        return self.run.features(layer, {"crops": self.crops(obj_id).key})
+
+    def make_templates(self, obj_id: int) -> int:
+        """Render what is missing of an object's templates; returns how many there are."""
+        K, T_cam_obj, (height, width) = self.run.stages.render.cameras(self.run.model(obj_id).mesh)
+        ref, count = self.templates(obj_id), len(T_cam_obj)
+
+        def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
+            rgb, depth_mm = self.run.stages.render.render(
+                self.run.model(obj_id).mesh, K, T_cam_obj[rows], (height, width)
+            )
+            empty = np.flatnonzero(~(depth_mm > 0).any((1, 2)))
+            if len(empty):
+                raise DzopError(f"object {obj_id}: view {rows[empty[0]]} shows nothing; is the mesh closed and in mm?")
+            return {ref.key: {"rgb": rgb, "depth_mm": depth_mm, "T_cam_obj": T_cam_obj[rows]}}
+
+        layout = {
+            "rgb": Layout((height, width, 3), "uint8", compress=True),
+            "depth_mm": Layout((height, width), "float32", compress=True),
+            "T_cam_obj": Layout((4, 4), "float64"),
+        }
+        self.run.fill(
+            "templates", f"render object {obj_id}", {ref: layout}, count, VIEWS_PER_BATCH, compute, {"K": K.tolist()}
+        )
+        return count
+
+    def read_views(self, obj_id: int, rows: Sequence[int] | None = None) -> Templates:
+        """An object's templates, or some of them."""
+        entry = self.run.store.read(self.templates(obj_id))
+        depth_mm = entry.array("depth_mm", rows)
+        K = np.array(entry.document["K"])
+        return Templates(entry.array("rgb", rows), depth_mm, depth_mm > 0, K, entry.array("T_cam_obj", rows))
+
+    def make_crops(self, obj_id: int, count: int) -> None:
+        """Crop what is missing of an object's templates."""
+        ref = self.crops(obj_id)
+
+        def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
+            views = self.read_views(obj_id, rows)
+            h, w = views.mask.shape[1:]
+            whole = (-0.5, -0.5, w - 0.5, h - 0.5)
+            crops = [self.run.stages.crop(rgb, mask, whole) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
+            return {ref.key: stacked(crops)}
+
+        self.run.fill(
+            "template crops", f"crop object {obj_id}", {ref: self.run.crops_layout()}, count, CROPS_PER_BATCH, compute
+        )
+
+    def make_features(self, obj_id: int, count: int, layers: Sequence[int]) -> None:
+        """Extract what is missing of an object's template features."""
+        refs = {layer: self.features(obj_id, layer) for layer in layers}
+        self.run.extract(
+            "template features", f"features of object {obj_id}", refs, count, lambda rows: self._crops_of(obj_id, rows)
+        )
+
+    def _crops_of(self, obj_id: int, rows: Sequence[int]) -> Crops:
+        entry = self.run.store.read(self.crops(obj_id))
+        geometry = None
+        if self.run.stages.extract.needs_geometry:
+            views = self.read_views(obj_id, rows)
+            geometry = Geometry(list(views.depth_mm), np.repeat(views.K[None], len(rows), 0), views.T_cam_obj)
+        return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
+
+    def onboard(self, obj_id: int) -> None:
+        """Everything offline of one object."""
+        count = self.make_templates(obj_id)
+        self.make_crops(obj_id, count)
+        self.make_features(obj_id, count, self.run.stages.layers)
+
+    def bank(self, obj_id: int) -> StoredBank:
+        """An object's templates for the online route."""
+        layers = self.run.stages.layers
+        features = {layer: self.run.store.read(self.features(obj_id, layer)) for layer in layers}
+        crops, templates = self.run.store.read(self.crops(obj_id)), self.run.store.read(self.templates(obj_id))
+        K = np.array(templates.document["K"])
+
+        @lru_cache(maxsize=64)
+        def view(index: int) -> TemplateView:
+            return TemplateView(
+                features={layer: self.run.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()},
+                mask=self.run.tensor(crops.array("mask", [index])[0]),
+                A_crop_img=crops.array("A_crop_img", [index])[0],
+                depth_mm=templates.array("depth_mm", [index])[0],
+                K=K,
+                T_cam_obj=templates.array("T_cam_obj", [index])[0],
+            )
+
+        match_layer = features[self.run.stages.match.layer].array("maps")
+        return StoredBank(self.run.tensor(match_layer), self.run.tensor(crops.array("mask")), view)

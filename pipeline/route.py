@@ -1,0 +1,220 @@
+"""The method on one page: a detection's features and its object's templates -> a pose, or the reason why there is none.
+
+mesh -render-> templates -crop, extract-> template features            (offline, once for every object)
+image -detect, crop, extract-> query features                          (once for every image)
+query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> pose
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.errors import NoPose
+from pipeline.functional import camera, rigid
+from pipeline.items.features import Clusters, FusedPair
+from pipeline.items.matches import Correspondences, TemplateMatch
+from pipeline.items.poses import PoseSolution
+from pipeline.stages.cluster import Clusterer
+from pipeline.stages.correspond import Corresponder
+from pipeline.stages.crop import Cropper
+from pipeline.stages.detect import Detector
+from pipeline.stages.extract import Extractor
+from pipeline.stages.fuse import Fuser
+from pipeline.stages.lift import lift
+from pipeline.stages.match import Matcher
+from pipeline.stages.render import Renderer
+from pipeline.stages.solve import Solver
+
+MIN_POINTS = 4
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Which variant at each stage, and whether a template's own pose may stand in for a failed solver."""
+
+    render: Renderer
+    extract: Extractor
+    crop: Cropper
+    match: Matcher
+    fuse: Fuser
+    cluster: Clusterer
+    correspond: Corresponder
+    solve: Solver
+    detect: Detector
+    fallback: bool = False
+
+    @property
+    def layers(self) -> tuple[int, ...]:
+        """Decoder layers the route reads: the template layer and the hyperfeature layers."""
+        return tuple(sorted({self.match.layer, *self.fuse.layers}))
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """One detection: features by layer, its crop, and its camera."""
+
+    features: Mapping[int, Float[Tensor, "c h w"]]
+    mask: Bool[Tensor, "S S"]
+    A_crop_img: Float[np.ndarray, "3 3"]
+    K: Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateView:
+    """One template as correspondences need it."""
+
+    features: Mapping[int, Float[Tensor, "c h w"]]
+    mask: Bool[Tensor, "S S"]
+    A_crop_img: Float[np.ndarray, "3 3"]
+    depth_mm: Float[np.ndarray, "H W"]
+    K: Float[np.ndarray, "3 3"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
+
+
+class TemplateBank(Protocol):
+    """An object's templates: features of the match layer and crop masks of all of them, any view in full."""
+
+    features: Float[Tensor, "n c h w"]
+    mask: Bool[Tensor, "n S S"]
+
+    def view(self, index: int) -> TemplateView:
+        """Everything about one template."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """What one template led to; ``solution`` None with the ``failure`` that stopped it."""
+
+    template_id: int
+    template_score: float
+    pair: FusedPair | None = None
+    clusters: Clusters | None = None
+    matches: Correspondences | None = None
+    points_obj: Float[np.ndarray, "m 3"] | None = None
+    query_px_img: Float[np.ndarray, "m 2"] | None = None
+    solution: PoseSolution | None = None
+    failure: NoPose | None = None
+
+    @property
+    def inliers(self) -> int:
+        """Correspondences that support the pose."""
+        return int(self.solution.inliers.sum()) if self.solution else 0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What stages clamped or skipped."""
+        said = (self.pair and self.pair.note, self.clusters and self.clusters.note)
+        return tuple(note for note in said if note)
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The whole online route of one detection: the matched templates and one hypothesis each, best first."""
+
+    match: TemplateMatch
+    hypotheses: tuple[Hypothesis, ...]
+    times_s: Mapping[str, float]
+
+    @property
+    def best(self) -> Hypothesis:
+        """Most inliers; of equals the better template. Nothing here sees ground truth."""
+        return self.hypotheses[0]
+
+
+@dataclass
+class Clock:
+    """Seconds by stage."""
+
+    times_s: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Add the block's seconds to ``stage``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times_s[stage] = self.times_s.get(stage, 0.0) + time.perf_counter() - start
+
+
+def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
+    """The online route. Raises NoPose when no template can be compared; a template that leads nowhere keeps its reason."""
+    clock = Clock()
+    with clock("match"):
+        match = stages.match(query.features[stages.match.layer], query.mask, bank.features, bank.mask)
+    ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
+    hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
+    hypotheses.sort(key=lambda h: -h.inliers)  # stable: equals stay in the order of their templates
+    return Trace(match, tuple(hypotheses), clock.times_s)
+
+
+def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, score: float, clock: Clock) -> Hypothesis:
+    parts: dict[str, object] = {}
+    try:
+        with clock("read template"):
+            template = bank.view(index)
+        with clock("fuse"):
+            pair = stages.fuse(query.features, template.features, query.mask, template.mask)
+            parts["pair"] = pair
+        with clock("cluster"):
+            clusters = stages.cluster(pair)
+            parts["clusters"] = clusters
+        with clock("correspond"):
+            matches = stages.correspond(pair, clusters, crop_size=stages.crop.size)
+            parts["matches"] = matches
+        with clock("lift"):
+            points_obj, query_px_img = _lifted(matches, query, template)
+            parts |= {"points_obj": points_obj, "query_px_img": query_px_img}
+        with clock("solve"):
+            seen = np.isfinite(points_obj).all(1)
+            if seen.sum() < MIN_POINTS:
+                raise NoPose("lift", f"{seen.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
+            solution = stages.solve(points_obj[seen], query_px_img[seen], query.K)
+            inliers = np.zeros(len(seen), bool)
+            inliers[seen] = solution.inliers
+            parts["solution"] = PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
+    except NoPose as failure:
+        parts["failure"] = failure
+    return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
+
+
+def _lifted(
+    matches: Correspondences, query: Query, template: TemplateView
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 2"]]:
+    """Object points (mm, NaN off the object) and the query's full-image pixels they correspond to."""
+    template_px = matches.template_px.double().cpu().numpy()
+    query_px = matches.query_px.double().cpu().numpy()
+    points_obj = lift(template_px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
+    return points_obj, camera.apply(np.linalg.inv(query.A_crop_img), query_px)
+
+
+def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:
+    """T_cam_obj from a template alone: its rotation, and the translation that puts it where and as large as the crop is.
+
+    The object's origin keeps its place in the crop; depth scales with focal length times crop magnification; the
+    rotation is turned with the viewing ray, so that the object looks the same from its new place in the image.
+    """
+    t = template.T_cam_obj[:3, 3]
+    origin_crop = camera.apply(template.A_crop_img, camera.project(template.K, t))
+    origin_img = camera.apply(np.linalg.inv(query.A_crop_img), origin_crop)
+    zoom_template = template.A_crop_img[0, 0] * template.K[0, 0]
+    zoom_query = query.A_crop_img[0, 0] * query.K[0, 0]
+    depth = t[2] * zoom_query / zoom_template
+    position = camera.unproject(query.K, origin_img[None], np.array([depth]))[0]
+    turn = rigid.rotation_between(t, position)
+    return rigid.rigid(turn @ template.T_cam_obj[:3, :3], position)
+
+
+def to_device(features: Mapping[int, np.ndarray], device: str) -> dict[int, Tensor]:
+    """Stored maps as float32 tensors on a device."""
+    return {layer: torch.from_numpy(maps).to(device).float() for layer, maps in features.items()}

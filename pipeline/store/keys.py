@@ -1,0 +1,29 @@
+"""Identity: key = sha256 of the canonical JSON of (recipe, input keys), a Merkle tree from mesh bytes to poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.spec import canonical, digest
+
+
+@dataclass(frozen=True)
+class Ref:
+    """Where an entry lies and what it is made from. ``made_from`` is the hashed text; it is stored with the entry."""
+
+    folder: str
+    key: str
+    made_from: str
+
+    @property
+    def path(self) -> str:
+        """``<folder>/<key>``, below the store's root."""
+        return f"{self.folder}/{self.key}"
+
+
+def make_ref(folder: str, recipe: Mapping[str, Any], inputs: Mapping[str, str]) -> Ref:
+    """The entry of ``recipe`` applied to ``inputs`` (name -> key or file digest), below ``folder``."""
+    made_from = {"recipe": dict(recipe), "inputs": dict(inputs)}
+    return Ref(folder, digest(made_from), canonical(made_from))

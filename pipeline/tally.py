@@ -1,0 +1,66 @@
+"""What a run computed and what it found: rows and seconds by step, and progress bars for what takes long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from tqdm import tqdm
+
+STEPS = (
+    "templates",
+    "template crops",
+    "template features",
+    "detections",
+    "query crops",
+    "query features",
+    "poses",
+    "overlays",
+)
+
+
+@dataclass
+class Count:
+    """Rows of one step."""
+
+    computed: int = 0
+    reused: int = 0
+    time_s: float = 0.0
+
+
+@dataclass
+class Tally:
+    """Counts by step. ``progress`` False silences the bars, never the table."""
+
+    progress: bool = True
+    counts: dict[str, Count] = field(default_factory=dict)
+
+    def add(self, step: str, *, computed: int = 0, reused: int = 0, time_s: float = 0.0) -> None:
+        """Count rows of a step."""
+        count = self.of(step)
+        count.computed += computed
+        count.reused += reused
+        count.time_s += time_s
+
+    def of(self, step: str) -> Count:
+        """The counts of a step so far."""
+        return self.counts.setdefault(step, Count())
+
+    @contextmanager
+    def bar(self, total: int, title: str, unit: str) -> Iterator[Callable[[int], None]]:
+        """A progress bar that appears after three seconds; yields the function that moves it."""
+        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=not self.progress, dynamic_ncols=True) as bar:
+            yield lambda rows: (bar.update(rows), None)[1]
+
+    def table(self) -> str:
+        """Step, computed, reused, seconds; steps in the order of the route."""
+        lines = [f"{'step':<20}{'computed':>10}{'reused':>10}{'seconds':>10}"]
+        for step in sorted(self.counts, key=STEPS.index):
+            count = self.counts[step]
+            lines.append(f"{step:<20}{count.computed:>10}{count.reused:>10}{count.time_s:>10.1f}")
+        return "\n".join(lines)
+
+    def as_record(self) -> dict[str, dict[str, float]]:
+        """JSON-able counts."""
+        return {step: {**vars(count), "time_s": round(count.time_s, 3)} for step, count in self.counts.items()}

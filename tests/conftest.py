@@ -1,0 +1,33 @@
+"""Fixtures every test may use. Shapes in annotations are checked while tests run."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from jaxtyping import install_import_hook
+
+os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+install_import_hook(["pipeline.functional"], "beartype.beartype")
+torch.set_num_threads(int(os.environ.get("DZOP_TEST_THREADS", "2")))
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _shared(*parts: str) -> Path:
+    path = SHARED.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"needs the photographs and values of ../shared/{'/'.join(parts)}, which only the developers have")
+    return path
+
+
+@pytest.fixture(scope="session")
+def bop_mini() -> Path:
+    """Real photographs, meshes and ground truth in BOP format: lmo/ and ycbv/."""
+    return _shared("bop_mini")
+
+
+@pytest.fixture(scope="session")
+def bop_reference() -> Path:
+    """bop_toolkit's own values of the pose errors."""
+    return _shared("reference", "bop_metrics")

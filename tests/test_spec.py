@@ -1,0 +1,73 @@
+from typing import ClassVar, Literal
+
+import pytest
+
+from pipeline.errors import BadInput
+from pipeline.spec import NonNegative, Positive, Spec, build, canonical, digest, spec
+
+
+@spec
+class Toy(Spec):
+    kind: ClassVar[str] = "match.toy"
+    layer: NonNegative = 2
+    weight: float = 1.0
+    layers: tuple[int, ...] = (2, 5)
+    mode: Literal["total", "per_layer"] = "total"
+    flag: bool = True
+
+
+@spec
+class Outer(Spec):
+    kind: ClassVar[str] = "extract.outer"
+    first: Toy
+    count: Positive = 3
+
+
+def test_every_field_enters_the_recipe():
+    recipe = {"kind": "match.toy", "version": 1, "layer": 2, "weight": 1.0, "layers": [2, 5], "mode": "total", "flag": True}
+    assert Toy().recipe() == recipe
+
+
+def test_nested_specs_enter_with_kind_and_version():
+    assert Outer(first=Toy()).recipe()["first"] == Toy().recipe()
+
+
+def test_one_and_its_lookalikes_have_different_digests():
+    assert len({digest({"x": value}) for value in (1, 1.0, True, "1", [1], None)}) == 6
+
+
+def test_the_order_of_fields_does_not_matter():
+    assert canonical({"b": 1, "a": 2}) == canonical({"a": 2, "b": 1}) == '{"a":2,"b":1}'
+
+
+def test_a_whole_number_for_a_float_is_that_float():
+    assert digest(build(Toy, {"weight": 2}, where="match").recipe()) == digest(Toy(weight=2.0).recipe())
+
+
+def test_specs_cannot_be_changed():
+    with pytest.raises(AttributeError):
+        Toy().layer = 3  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"layer": -1}, "match.layer: found -1, needs greater than or equal to 0"),
+        ({"layer": "2"}, "match.layer: found '2', needs a valid integer"),
+        ({"layer": True}, "match.layer: found True, needs a valid integer"),
+        ({"layer": 2.0}, "match.layer: found 2.0, needs a valid integer"),
+        ({"layers": [2, "5"]}, "match.layers.1: found '5', needs a valid integer"),
+        ({"mode": "both"}, "match.mode: found 'both', needs 'total' or 'per_layer'"),
+        ({"flag": 1}, "match.flag: found 1, needs a valid boolean"),
+        ({"top": 5}, "match.top: found an unknown field, needs one of: layer, weight, layers, mode, flag"),
+    ],
+)
+def test_a_wrong_field_is_told_in_one_line(values: dict, message: str):
+    with pytest.raises(BadInput) as error:
+        build(Toy, values, where="match")
+    assert str(error.value) == message
+
+
+def test_a_missing_field_is_named():
+    with pytest.raises(BadInput, match="outer.first"):
+        build(Outer, {}, where="outer")
