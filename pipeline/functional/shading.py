@@ -1,0 +1,103 @@
+"""Surface -> colour: normals with creases, textures with mip levels, one headlight. Both renderers shade with these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+PLAIN = 178  # grey of a mesh without colours, of 255
+
+
+def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Normals as long as twice the face's area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease_deg: float
+) -> Float[np.ndarray, "f 3 3"]:
+    """Unit normals at each face's corners: smooth, but the face's own where the two differ by more than the crease.
+
+    Smooth is the area-weighted mean over the faces that touch the corner's position, so that copies of a vertex on a
+    texture's seam share it. 0 degrees give flat shading, 180 smooth throughout; a box needs less than 45.
+    """
+    flat = face_normals(vertices, faces)
+    _, position = np.unique(vertices, axis=0, return_inverse=True)
+    corner = position.reshape(-1)[faces]
+    weights = np.repeat(flat, 3, axis=0)
+    count = int(corner.max()) + 1
+    smooth = np.stack([np.bincount(corner.reshape(-1), weights[:, axis], count) for axis in range(3)], axis=-1)
+    at_corner, own = _unit(smooth)[corner], _unit(flat)[:, None]
+    agree = (at_corner * own).sum(-1, keepdims=True) >= np.cos(np.radians(crease_deg))
+    return np.where(agree & (crease_deg > 0), at_corner, own)
+
+
+def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+
+
+def lit(
+    albedo: Float[np.ndarray, "*n 3"],
+    normal: Float[np.ndarray, "*n 3"],
+    to_light: Float[np.ndarray, "*n 3"],
+    *,
+    ambient: float,
+    diffuse: float,
+) -> Float[np.ndarray, "*n 3"]:
+    """Albedo (ambient + diffuse |cos|): Lambert's law, from both sides. Vectors need not have unit length."""
+    cos = np.abs(np.einsum("...c,...c->...", normal, to_light))
+    squares = np.einsum("...c,...c->...", normal, normal) * np.einsum("...c,...c->...", to_light, to_light)
+    gain = ambient + diffuse * cos / np.sqrt(np.maximum(squares, 1e-30))
+    return albedo * gain[..., None]
+
+
+def mip_levels(texture: UInt8[np.ndarray, "H W 3"]) -> tuple[UInt8[np.ndarray, "h w 3"], ...]:
+    """The texture and its halvings (box filter), the finest first, down to 4 pixels."""
+    from PIL import Image
+
+    levels = [texture]
+    while min(levels[-1].shape[:2]) >= 8:
+        levels.append(np.asarray(Image.fromarray(levels[-1]).reduce(2)))
+    return tuple(levels)
+
+
+def texel_density(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    uv: Float[np.ndarray, "v 2"],
+    size_hw: tuple[int, int],
+) -> Float[np.ndarray, " f"]:
+    """Texels per mm on each face, 0 for a face of no area."""
+    a, b, c = (uv[faces[:, k]] * (size_hw[1], size_hw[0]) for k in range(3))
+    texels = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    area = np.linalg.norm(face_normals(vertices, faces), axis=-1)
+    return np.sqrt(np.where(area > 0, texels / np.maximum(area, 1e-30), 0.0))
+
+
+def texture_colour(
+    levels: Sequence[UInt8[np.ndarray, "h w 3"]], uv: Float[np.ndarray, "n 2"], texels: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Colours (0..255) at ``uv``, bilinear in the mip level nearest to the samples' width in ``texels``."""
+    level = np.clip(np.rint(np.log2(np.maximum(texels, 1.0))), 0, len(levels) - 1).astype(int)
+    colour = np.empty((len(uv), 3), dtype=np.float32)
+    for k in np.unique(level):
+        rows = level == k
+        colour[rows] = _bilinear(levels[k], uv[rows])
+    return colour
+
+
+def _bilinear(image: UInt8[np.ndarray, "h w 3"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Repeats beyond the borders; v = 0 is the lower edge of the last row."""
+    h, w = image.shape[:2]
+    texels = image.reshape(-1, 3)
+    x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = (x - x0).astype(np.float32)[:, None], (y - y0).astype(np.float32)[:, None]
+    left, top = np.mod(x0, w).astype(np.int64), np.mod(y0, h).astype(np.int64)
+    right, top_row, bottom_row = (left + 1) % w, top * w, (top + 1) % h * w
+    upper = texels[top_row + left] * (1 - fx) + texels[top_row + right] * fx
+    lower = texels[bottom_row + left] * (1 - fx) + texels[bottom_row + right] * fx
+    return upper * (1 - fy) + lower * fy

@@ -1,0 +1,58 @@
+"""mesh -> the cameras of its templates: the fields that all renderers share."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from pipeline.functional.rigid import rigid
+from pipeline.functional.viewpoints import ViewpointSet, viewpoint_rotations
+from pipeline.items.objects import Mesh
+from pipeline.spec import Fraction, Positive, Spec, spec
+
+
+@spec
+class Studio(Spec):
+    """Where the cameras stand and how the light falls. Every field is explained in conf/render."""
+
+    viewpoints: ViewpointSet = "fibonacci"
+    count: Positive = 300
+    inplane: Positive = 1
+    size: Annotated[int, Field(ge=8, le=4096)] = 256
+    supersample: Annotated[int, Field(ge=1, le=8)] = 2
+    distance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 6.0
+    fill: Annotated[float, Field(gt=0, le=1)] = 0.9
+    ambient: Fraction = 0.45
+    diffuse: Fraction = 0.55
+    crease_deg: Annotated[float, Field(ge=0, le=180)] = 40.0
+
+    def cameras(self, mesh: Mesh) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 4 4"], tuple[int, int]]:
+        """K, T_cam_obj of all templates, and the image size (h, w).
+
+        All look at the centre of the mesh's bounding box, wherever its origin lies, from ``distance`` diameters of
+        the sphere around it, whose outline fills ``fill`` of the image's side: K is the same for every object.
+        """
+        centre, radius = bounding_sphere(mesh)
+        R = viewpoint_rotations(self.viewpoints, self.count, self.inplane)
+        t = np.array([0.0, 0.0, self.distance * 2 * radius]) - R @ centre
+        # a sphere of diameter 1 at distance D has an outline of radius f / sqrt(4 D^2 - 1)
+        focal = self.fill * self.size / 2 * (4 * self.distance**2 - 1) ** 0.5
+        middle = (self.size - 1) / 2
+        K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
+        return K, rigid(R, t), (self.size, self.size)
+
+
+def bounding_sphere(mesh: Mesh) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre of the bounding box of the mesh's faces, and the distance to their farthest vertex, mm."""
+    used = mesh.vertices[np.unique(mesh.faces)]
+    centre = (used.min(axis=0) + used.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(used - centre, axis=-1).max())
+
+
+def subpixels(supersample: int) -> Float[np.ndarray, "s 2"]:
+    """Offsets (x, y) of a pixel's samples from its centre: the centres of a grid of equal cells, row by row."""
+    steps = (np.arange(supersample) + 0.5) / supersample - 0.5
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
