@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Protocol
 
+import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor
 
+from pipeline.errors import NoPose
+from pipeline.functional.masks import cell_mask, foreground
 from pipeline.items.features import FusedPair
+from pipeline.spec import NonNegative
+
+Layers = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 
 
 class Fuser(Protocol):
@@ -25,3 +32,52 @@ class Fuser(Protocol):
     ) -> FusedPair:
         """Fused maps at the resolution of the finest layer. Raises NoPose when a mask has no cell."""
         ...
+
+
+def finest(maps: Mapping[int, Float[Tensor, "c h w"]], layers: Sequence[int]) -> int:
+    """Cells a side of the finest of the layers' maps."""
+    return max(maps[layer].shape[-1] for layer in layers)
+
+
+def samples(
+    query: Float[Tensor, "c h w"],
+    template: Float[Tensor, "c h w"],
+    masks: tuple[Bool[Tensor, "S S"], Bool[Tensor, "S S"]] | None,
+    *,
+    layer: int,
+) -> Float[Tensor, "m c"]:
+    """Features of the cells inside the masks (None: of all cells), the query's first.
+
+    Raises NoPose for an empty mask and for features that are not finite.
+    """
+    if masks is None:
+        sides = [query.flatten(1), template.flatten(1)]
+    else:
+        inside = _cell_masks(*masks, cells=query.shape[-1])
+        sides = [side.flatten(1)[:, foreground(mask)] for side, mask in zip((query, template), inside, strict=True)]
+    both = torch.cat(sides, dim=1).T
+    if not bool(torch.isfinite(both).all()):
+        raise NoPose("fuse", f"features of layer {layer} are not finite")
+    return both
+
+
+def fused(
+    query: Float[Tensor, "d h w"],
+    template: Float[Tensor, "d h w"],
+    query_mask: Bool[Tensor, "S S"],
+    template_mask: Bool[Tensor, "S S"],
+    note: str = "",
+) -> FusedPair:
+    """The pair with its masks at the maps' resolution. Raises NoPose for an empty mask."""
+    of_query, of_template = _cell_masks(query_mask, template_mask, cells=query.shape[-1])
+    return FusedPair(query, template, of_query, of_template, note)
+
+
+def _cell_masks(
+    query_mask: Bool[Tensor, "S S"], template_mask: Bool[Tensor, "S S"], *, cells: int
+) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    masks = cell_mask(query_mask, cells=cells), cell_mask(template_mask, cells=cells)
+    for name, mask in zip(("query", "template"), masks, strict=True):
+        if not mask.any():
+            raise NoPose("fuse", f"{name} mask is empty, needs 1 pixel")
+    return masks

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pipeline.errors import NoPose
 from pipeline.items.matches import TemplateMatch
 
 
@@ -24,3 +26,17 @@ class Matcher(Protocol):
     ) -> TemplateMatch:
         """The best templates of one query. Raises NoPose when nothing can be compared."""
         ...
+
+
+def ranked(score: Float[Tensor, " n"], *, top_k: int) -> TemplateMatch:
+    """The ``top_k`` best of all templates' scores; of equals the one with the lower index.
+
+    Raises NoPose when scores are not finite or none differs from 0.
+    """
+    if not bool(torch.isfinite(score).all()):
+        raise NoPose("match", "features are not finite")
+    if not bool(score.any()):
+        raise NoPose("match", "query and templates share no feature: every similarity is 0")
+    best, index = torch.sort(score, descending=True, stable=True)
+    margin = float(best[0] - best[top_k]) if len(best) > top_k else 0.0
+    return TemplateMatch(index[:top_k], best[:top_k], margin)

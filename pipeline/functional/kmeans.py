@@ -1,0 +1,64 @@
+"""k-means that gives the same bytes every time.
+
+scikit-learn's threads add their partial sums in whatever order they end, and its seeding takes 60 to 150 ms for the
+two maps of a pair; the same seeding and Lloyd's steps below take a quarter of that on two cores.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int
+from torch import Tensor
+
+
+def kmeans(
+    points: Float32[Tensor, "m c"], *, count: int, seed: int, iterations: int
+) -> tuple[Int[Tensor, " m"], Float32[Tensor, "k c"]]:
+    """Label of each point and the k <= ``count`` centres; every centre has a point.
+
+    Lloyd's steps from a seeded k-means++ start (Arthur and Vassilvitskii, SODA 2007), until no label changes or
+    ``iterations`` are done. Runs on the CPU: sums on other devices depend on their order.
+    """
+    x = points.cpu()
+    centre = x[torch.from_numpy(spread_start(x.numpy(), count=count, seed=seed))]
+    label = _nearest_centre(x, centre)
+    for _ in range(iterations):
+        centre = _means(x, label, centre)
+        before, label = label, _nearest_centre(x, centre)
+        if torch.equal(before, label):
+            break
+    used, label = label.unique(return_inverse=True)
+    return label.to(points.device), _means(x, label, centre[used]).to(points.device)
+
+
+def spread_start(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -> Int[np.ndarray, " k"]:
+    """Indices of k-means++ seeds: each drawn with probability proportional to its squared distance to those before.
+
+    Fewer than ``count`` where there are fewer distinct points.
+    """
+    draws = np.random.default_rng(seed).random(count)
+    squared = np.einsum("mc,mc->m", points, points)
+    nearest = np.full(len(points), np.inf, dtype=np.float32)
+    chosen = [min(int(draws[0] * len(points)), len(points) - 1)]
+    for draw in draws[1:]:
+        i = chosen[-1]
+        distance = squared + squared[i] - 2 * (points @ points[i])
+        nearest = np.minimum(nearest, np.where(distance > 1e-6 * squared[i], distance, 0))  # rounding is no distance
+        cumulative = np.cumsum(nearest, dtype=np.float64)
+        if cumulative[-1] <= 0:
+            break
+        drawn = int(np.searchsorted(cumulative, draw * cumulative[-1], side="right"))
+        chosen.append(min(drawn, len(points) - 1))
+    return np.array(chosen)
+
+
+def _nearest_centre(x: Tensor, centre: Tensor) -> Tensor:
+    return torch.addmm((centre * centre).sum(1), x, centre.T, alpha=-2).argmin(1)
+
+
+def _means(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:
+    """Mean of each cluster's points; a cluster that lost all of them keeps its centre."""
+    number = torch.bincount(label, minlength=len(centre))[:, None]
+    total = torch.zeros_like(centre).index_add_(0, label, x)
+    return torch.where(number > 0, total / number.clamp(min=1), centre)

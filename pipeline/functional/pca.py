@@ -1,0 +1,44 @@
+"""Principal component analysis by the eigenvectors of the smaller Gram matrix: exact, and the same every time."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_NEGLIGIBLE = 1e-5  # of the largest variance: below it, a float32 Gram matrix of float16 features holds rounding
+
+
+def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
+    """Mean, and the k <= ``dim`` orthonormal directions of largest variance, largest first.
+
+    k is smaller where the samples span fewer dimensions. Of each axis the component of largest magnitude is positive.
+    Only the leading eigenvectors are computed (LAPACK syevr, on the CPU for every device). Raises ValueError for
+    samples that are not finite.
+    """
+    mean = samples.mean(0)
+    centred = samples - mean
+    wide = centred.shape[0] < centred.shape[1]
+    gram = centred @ centred.T if wide else centred.T @ centred
+    variance, vectors = _leading(gram.cpu().numpy().astype(np.float64), dim)
+    leading = torch.from_numpy(vectors).to(samples.device, samples.dtype)
+    if wide:
+        leading = centred.T @ (leading / torch.from_numpy(variance).sqrt().to(leading))
+    return mean, _signed(leading)
+
+
+def _leading(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    size = len(gram)
+    values, vectors = scipy.linalg.eigh(gram, subset_by_index=[max(0, size - dim), size - 1], driver="evr")
+    values, vectors = values[::-1].copy(), vectors[:, ::-1].copy()
+    keep = values > max(_NEGLIGIBLE * values[0], np.finfo(np.float32).tiny)
+    return values[keep], vectors[:, keep]
+
+
+def _signed(axes: Float[Tensor, "c k"]) -> Float[Tensor, "c k"]:
+    if axes.shape[1] == 0:
+        return axes
+    largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))
+    return axes * torch.where(largest < 0, -1.0, 1.0)

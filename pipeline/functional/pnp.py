@@ -1,0 +1,75 @@
+"""What solvers of the perspective-n-point problem share: errors, and the polish of a pose. K has no skew."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.functional.camera import project
+from pipeline.functional.rigid import nearest_rotation, rigid, transform
+
+
+def pose_of(rvec: Float[np.ndarray, "3 1"], tvec: Float[np.ndarray, "3 1"]) -> Float[np.ndarray, "4 4"] | None:
+    """T_cam_obj of OpenCV's rotation vector and translation, None when they are not finite."""
+    if not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
+        return None
+    return rigid(nearest_rotation(cv2.Rodrigues(rvec.reshape(3))[0]), tvec.reshape(3))
+
+
+def reprojection_error_px(
+    points_obj: Float[np.ndarray, "m 3"],
+    px: Float[np.ndarray, "m 2"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " m"]:
+    """Distances in the image, pixels; infinite for a point that is not in front of the camera."""
+    p = transform(T_cam_obj, points_obj)
+    front = p[:, 2] > 0
+    error = np.full(len(p), np.inf)
+    error[front] = np.linalg.norm(project(K, p[front]) - px[front], axis=1)
+    return error
+
+
+def truncated_cost(error_px: Float[np.ndarray, " m"], *, threshold_px: float) -> float:
+    """Sum of squared errors, each at most the threshold's: MSAC (Torr and Zisserman, CVIU 2000, Eq. 10)."""
+    return float(np.square(np.minimum(error_px, threshold_px)).sum())
+
+
+def least_squares_pose(
+    points_obj: Float[np.ndarray, "m 3"],
+    px: Float[np.ndarray, "m 2"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "4 4"] | None:
+    """The pose of least squared reprojection error near a pose, by Levenberg-Marquardt; None when that diverges."""
+    rvec, tvec = cv2.Rodrigues(T_cam_obj[:3, :3])[0], T_cam_obj[:3, 3:].copy()
+    try:
+        return pose_of(*cv2.solvePnPRefineLM(points_obj, px, K, None, rvec, tvec))
+    except cv2.error:
+        return None
+
+
+def polished(
+    points_obj: Float[np.ndarray, "m 3"],
+    px: Float[np.ndarray, "m 2"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    *,
+    threshold_px: float,
+    rounds: int = 3,
+) -> Float[np.ndarray, "4 4"]:
+    """The pose fitted to its inliers, then to those of the better pose; never one of greater truncated cost."""
+    error = reprojection_error_px(points_obj, px, K, T_cam_obj)
+    for _ in range(rounds):
+        near: Bool[np.ndarray, " m"] = error < threshold_px
+        if near.sum() < 4:
+            break
+        better = least_squares_pose(points_obj[near], px[near], K, T_cam_obj)
+        if better is None:
+            break
+        error_after = reprojection_error_px(points_obj, px, K, better)
+        if truncated_cost(error_after, threshold_px=threshold_px) >= truncated_cost(error, threshold_px=threshold_px):
+            break
+        T_cam_obj, error = better, error_after
+    return T_cam_obj

@@ -1,0 +1,106 @@
+"""Cosine similarities: of whole maps, of cells inside masks, of cells with the same label."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+_CPU_BLOCK, _CUDA_BLOCK = 1 << 20, 1 << 27  # values: the CPU's fits its cache, CUDA's amortises launches
+_PAIRS_BLOCK = 1 << 22  # cell pairs compared at a time
+
+
+def unit(x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+    """Rows of length 1; a row of zeros stays."""
+    return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
+
+
+def global_cosine(query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"]) -> Float[Tensor, " n"]:
+    """Cosine of the flattened maps, 0 where a map is all zero. The bank may be float16; sums are float32."""
+    q = unit(query.float().flatten())
+    dot, norm = [], []
+    for block in _float_blocks(bank):
+        flat = block.flatten(1)
+        dot.append(flat @ q)
+        norm.append(torch.linalg.vector_norm(flat, dim=1))
+    return _divided(torch.cat(dot), torch.cat(norm))
+
+
+def cell_cosine(query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w"]:
+    """Cosine of every cell of the query with the same cell of each map of the bank, 0 for cells of zeros."""
+    q = unit(query.float().movedim(0, -1)).movedim(-1, 0).contiguous()
+    dot, norm = [], []
+    for block in _float_blocks(bank):
+        dot.append((block * q).sum(1))
+        norm.append((block * block).sum(1).sqrt())
+    return _divided(torch.cat(dot), torch.cat(norm))
+
+
+def masked_mean(
+    values: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"], *, over: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
+    """Sum inside the mask over the given cell counts; 0 where the count is 0."""
+    return _divided((values * mask).sum((1, 2)), over)
+
+
+def mutual_nearest(similarity: Float[Tensor, "a b"]) -> Int[Tensor, "p 2"]:
+    """Rows and columns that are each other's most similar, by row."""
+    column = similarity.argmax(1)
+    row = torch.arange(len(similarity), device=similarity.device)
+    mutual = similarity.argmax(0)[column] == row
+    return torch.stack([row[mutual], column[mutual]], dim=1)
+
+
+def nearest_of_label(
+    a: Float[Tensor, "m c"], a_label: Int[Tensor, " m"], b: Float[Tensor, "n c"], b_label: Int[Tensor, " n"]
+) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
+    """Similarity a.b and index of the row of b most similar to each row of a among those with its label.
+
+    Labels count from 0. Similarity is -inf, and the index 0, where b has no row of that label.
+    """
+    similarity = torch.full((len(a),), -torch.inf, device=a.device)
+    index = torch.zeros(len(a), dtype=torch.int64, device=a.device)
+    labels = max(int(label.max()) + 1 if len(label) else 0 for label in (a_label, b_label))
+    a_groups, b_groups = _groups(a, a_label, labels), _groups(b, b_label, labels)
+    for (rows, a_rows), (columns, b_rows) in zip(a_groups, b_groups, strict=True):
+        if len(rows) and len(columns):
+            similarity[rows], nearest = _nearest(a_rows, b_rows)
+            index[rows] = columns[nearest]
+    return similarity, index
+
+
+def best_per_group(
+    value: Float[Tensor, " m"], group: Int[Tensor, " m"], candidate: Bool[Tensor, " m"], *, count: int
+) -> Int[Tensor, " k"]:
+    """Indices of each group's ``count`` candidates of highest value: by group, best first, of equals the first."""
+    index = candidate.nonzero()[:, 0]
+    index = index[torch.sort(value[index], descending=True, stable=True).indices]
+    ordered, by_group = torch.sort(group[index], stable=True)
+    first = torch.searchsorted(ordered, ordered)  # where each element's group starts
+    rank = torch.arange(len(ordered), device=ordered.device) - first
+    return index[by_group][rank < count]
+
+
+def _groups(x: Float[Tensor, "m c"], label: Int[Tensor, " m"], labels: int) -> list[tuple[Tensor, Tensor]]:
+    """Indices and rows of the members of label 0, 1, ..."""
+    order = label.argsort(stable=True)
+    sizes = torch.bincount(label, minlength=labels).tolist()
+    return list(zip(order.split(sizes), x[order].split(sizes), strict=True))
+
+
+def _nearest(a: Float[Tensor, "m c"], b: Float[Tensor, "n c"]) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
+    """Highest a.b of each row of a, and its row of b; rows of a go in blocks to bound memory."""
+    best = [(rows @ b.T).max(dim=1) for rows in a.split(max(1, _PAIRS_BLOCK // len(b)))]
+    return torch.cat([found.values for found in best]), torch.cat([found.indices for found in best])
+
+
+def _float_blocks(bank: Tensor) -> Iterator[Tensor]:
+    values = _CUDA_BLOCK if bank.is_cuda else _CPU_BLOCK
+    for block in bank.split(max(1, values // max(1, bank[0].numel()))):
+        yield block.float()
+
+
+def _divided(numerator: Tensor, denominator: Tensor) -> Tensor:
+    return torch.where(denominator > 0, numerator / denominator, torch.zeros_like(numerator))

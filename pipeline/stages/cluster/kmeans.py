@@ -1,0 +1,85 @@
+"""fused pair -> k-means clusters of both sides, paired by the cosine of their centres."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pipeline.errors import NoPose
+from pipeline.functional.camera import grid_xy
+from pipeline.functional.epipolar import epipolar_inliers
+from pipeline.functional.kmeans import kmeans
+from pipeline.functional.masks import foreground
+from pipeline.functional.similarity import mutual_nearest, unit
+from pipeline.items.features import Clusters, FusedPair
+from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
+
+
+@spec
+class KMeans(Spec):
+    """Clusters that may correspond (von Gimborn et al., "Cluster-wise correspondence estimation").
+
+    Each side's foreground cells, scaled to unit length so that distance is cosine, fall into ``count`` clusters;
+    clusters whose centres are each other's most similar form a pair. ``epipolar`` drops the pairs whose mean positions
+    (in cells) lie more than ``threshold_cells`` off the epipolar lines of one fundamental matrix; it is skipped, and
+    ``note`` says why, where that matrix is not defined: fewer than 8 pairs, or a near-planar set.
+    """
+
+    kind: ClassVar[str] = "cluster.kmeans"
+    version: ClassVar[int] = 1
+
+    count: Positive = 200
+    iterations: Positive = 20
+    seed: NonNegative = 0
+    epipolar: bool = True
+    threshold_cells: PositiveFloat = 2.0
+    epipolar_iterations: Positive = 1000
+
+    def __call__(self, pair: FusedPair) -> Clusters:
+        """Labels, pairs, and what was clamped or skipped. Raises NoPose for a mask without a cell."""
+        query, query_centre = self._side("query", pair.query, pair.query_mask)
+        template, template_centre = self._side("template", pair.template, pair.template_mask)
+        pairs = mutual_nearest(unit(query_centre) @ unit(template_centre).T)
+        notes = [
+            f"{name}: {len(centre)} of {self.count} clusters"
+            for name, centre in (("query", query_centre), ("template", template_centre))
+            if len(centre) < self.count
+        ]
+        if self.epipolar:
+            positions = [_mean_xy(query)[pairs[:, 0].cpu()], _mean_xy(template)[pairs[:, 1].cpu()]]
+            keep, skipped = self._consistent(*(p.numpy() for p in positions))
+            pairs = pairs if keep is None else pairs[torch.from_numpy(keep).to(pairs.device)]
+            notes += [f"epipolar check skipped: {skipped}"] if skipped else []
+        return Clusters(query, template, pairs, note="; ".join(notes))
+
+    def _side(
+        self, name: str, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]
+    ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "k d"]]:
+        cells = foreground(mask)
+        if len(cells) == 0:
+            raise NoPose("cluster", f"{name} mask has no cell")
+        points = unit(features.float().flatten(1).T[cells])
+        of_cell, centre = kmeans(points, count=self.count, seed=self.seed, iterations=self.iterations)
+        label = torch.full_like(mask, -1, dtype=torch.int64)
+        label.view(-1)[cells] = of_cell
+        return label, centre
+
+    def _consistent(
+        self, query_xy: Float[np.ndarray, "p 2"], template_xy: Float[np.ndarray, "p 2"]
+    ) -> tuple[Bool[np.ndarray, " p"] | None, str]:
+        return epipolar_inliers(
+            query_xy, template_xy, threshold=self.threshold_cells, iterations=self.epipolar_iterations, seed=self.seed
+        )
+
+
+def _mean_xy(label: Int[Tensor, "h w"]) -> Float[Tensor, "k 2"]:
+    """Mean position (x, y) of each cluster's cells, in cells."""
+    flat = label.flatten().cpu()
+    cells = (flat >= 0).nonzero()[:, 0]
+    of_cell, xy = flat[cells], grid_xy(cells, width=label.shape[1]).double()
+    total = torch.zeros(int(of_cell.max()) + 1, 2, dtype=torch.float64).index_add_(0, of_cell, xy)
+    return total / torch.bincount(of_cell)[:, None]

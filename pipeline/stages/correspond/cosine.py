@@ -1,0 +1,80 @@
+"""fused pair, clusters -> corresponding points, in crop pixels: the most similar cells of paired clusters."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.errors import NoPose
+from pipeline.functional.camera import cell_to_px, grid_xy
+from pipeline.functional.masks import foreground
+from pipeline.functional.similarity import best_per_group, nearest_of_label, unit
+from pipeline.functional.subpixel import neighbourhood_shift
+from pipeline.items.features import Clusters, FusedPair
+from pipeline.items.matches import Correspondences
+from pipeline.spec import Positive, Spec, spec
+
+
+@spec
+class Cosine(Spec):
+    """Each query cell's most similar template cell inside the paired cluster, the ``per_cluster`` best of each pair.
+
+    von Gimborn et al., "Semantic Correspondence Estimation" ("mutual semantic correspondences"; top 10).
+    ``per_cluster`` keeps large clusters from outvoting small ones; a single pair has nothing to balance and keeps all.
+    ``mutual``: only where the query cell is the template cell's most similar too. ``kernel``: side, in cells, of the
+    neighbourhood that places the template's point in between cells (functional.subpixel); 1 = off, the cell's centre.
+    """
+
+    kind: ClassVar[str] = "correspond.cosine"
+    version: ClassVar[int] = 1
+
+    per_cluster: Positive = 10
+    mutual: bool = True
+    kernel: Literal[1, 3, 5, 7] = 3
+
+    def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
+        """Matched points, by cluster pair, best first. Raises NoPose when there is none."""
+        query_cell, query_pair = _cells_in_pairs(clusters.query_label, clusters.pairs[:, 0])
+        template_cell, template_pair = _cells_in_pairs(clusters.template_label, clusters.pairs[:, 1])
+        if len(query_cell) == 0 or len(template_cell) == 0:
+            raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
+        query = unit(pair.query.float().movedim(0, -1).flatten(0, 1)[query_cell])
+        template = unit(pair.template.float().movedim(0, -1))
+        similarity, nearest = nearest_of_label(query, query_pair, template.flatten(0, 1)[template_cell], template_pair)
+        candidate = similarity > 0
+        if self.mutual:
+            _, back = nearest_of_label(template.flatten(0, 1)[template_cell], template_pair, query, query_pair)
+            candidate &= back[nearest] == torch.arange(len(query), device=query.device)
+        limit = self.per_cluster if len(clusters.pairs) > 1 else len(query)
+        kept = best_per_group(similarity, query_pair, candidate, count=limit)
+        if len(kept) == 0:
+            raise NoPose("correspond", f"no cells of {len(clusters.pairs)} cluster pairs have a positive cosine")
+        template_kept = template_cell[nearest[kept]]
+        shift = neighbourhood_shift(query[kept], template, pair.template_mask, template_kept, kernel=self.kernel)
+        return Correspondences(
+            _px(query_cell[kept], torch.zeros_like(shift), like=pair.query, crop_size=crop_size),
+            _px(template_kept, shift, like=pair.template, crop_size=crop_size),
+            similarity[kept],
+            query_pair[kept],
+        )
+
+
+def _cells_in_pairs(
+    label: Int[Tensor, "h w"], paired: Int[Tensor, " p"]
+) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """Flat indices of the cells whose cluster is in a pair, and the index of that pair."""
+    pair_of = torch.full((int(label.max()) + 2,), -1, dtype=torch.int64, device=label.device)
+    pair_of[paired] = torch.arange(len(paired), device=label.device)
+    of_cell = pair_of[label.flatten()]  # background, -1, reads the last entry, which no cluster owns
+    cells = foreground(of_cell >= 0)
+    return cells, of_cell[cells]
+
+
+def _px(
+    cell: Int[Tensor, " m"], shift: Float[Tensor, "m 2"], *, like: Float[Tensor, "d h w"], crop_size: int
+) -> Float[Tensor, "m 2"]:
+    cells = like.shape[-1]
+    return cell_to_px(grid_xy(cell, width=cells) + shift, size=crop_size, cells=cells)

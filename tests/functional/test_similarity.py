@@ -1,0 +1,88 @@
+import numpy as np
+import torch
+
+from pipeline.functional import similarity
+from pipeline.functional.similarity import (
+    best_per_group,
+    cell_cosine,
+    global_cosine,
+    mutual_nearest,
+    nearest_of_label,
+    unit,
+)
+
+
+def _random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_scale_of_query_and_bank_does_not_matter():
+    query, bank = _random(6, 4, 4), _random(9, 6, 4, 4, seed=1)
+    for function in (global_cosine, cell_cosine):
+        assert torch.allclose(function(query, bank), function(3 * query, 0.2 * bank), atol=1e-6)  # float32 rounding
+
+
+def test_global_cosine_equals_numpy_in_double():
+    query, bank = _random(6, 4, 4), _random(9, 6, 4, 4, seed=1).half()
+    q, b = query.double().flatten().numpy(), bank.double().flatten(1).numpy()
+    expected = b @ q / np.linalg.norm(b, axis=1) / np.linalg.norm(q)
+    assert np.allclose(global_cosine(query, bank).numpy(), expected, atol=1e-6)  # float32 sums of 96 products
+
+
+def test_cell_cosine_equals_a_loop_over_cells():
+    query, bank = _random(6, 3, 3), _random(4, 6, 3, 3, seed=1).half()
+    bank[2, :, 1, 1] = 0
+    found = cell_cosine(query, bank)
+    for n in range(4):
+        for i in range(3):
+            for j in range(3):
+                a, b = query[:, i, j].double(), bank[n, :, i, j].double()
+                expected = 0.0 if not b.any() else float(a @ b / a.norm() / b.norm())
+                assert abs(float(found[n, i, j]) - expected) < 1e-6  # float32
+
+
+def test_blocks_of_the_bank_change_nothing(monkeypatch):
+    query, bank = _random(6, 4, 4), _random(9, 6, 4, 4, seed=1)
+    whole = cell_cosine(query, bank)
+    monkeypatch.setattr(similarity, "_CPU_BLOCK", 200)
+    assert torch.equal(cell_cosine(query, bank), whole)
+
+
+def test_mutual_nearest_pairs_are_best_in_row_and_column():
+    similarity_matrix = torch.tensor([[0.9, 0.1, 0.2], [0.8, 0.3, 0.1], [0.0, 0.2, 0.7]])
+    assert mutual_nearest(similarity_matrix).tolist() == [[0, 0], [2, 2]]
+
+
+def test_nearest_of_label_equals_a_loop(monkeypatch):
+    a, b = unit(_random(40, 5)), unit(_random(30, 5, seed=1))
+    generator = torch.Generator().manual_seed(2)
+    a_label, b_label = torch.randint(0, 6, (40,), generator=generator), torch.randint(0, 5, (30,), generator=generator)
+    for block in (1 << 22, 8):
+        monkeypatch.setattr(similarity, "_PAIRS_BLOCK", block)
+        value, index = nearest_of_label(a, a_label, b, b_label)
+        for i in range(40):
+            members = [j for j in range(30) if b_label[j] == a_label[i]]
+            if not members:
+                assert value[i] == -torch.inf
+                continue
+            best = max(members, key=lambda j: float(a[i] @ b[j]))
+            assert index[i] == best
+            assert abs(float(value[i] - a[i] @ b[best])) < 1e-6  # float32, another order of sums
+
+
+def test_best_per_group_keeps_the_highest_and_of_equals_the_first():
+    value = torch.tensor([0.5, 0.9, 0.9, 0.1, 0.7, 0.8])
+    group = torch.tensor([1, 1, 1, 1, 0, 0])
+    candidate = torch.tensor([True, True, True, True, True, False])
+    assert best_per_group(value, group, candidate, count=2).tolist() == [4, 1, 2]
+
+
+def test_nothing_to_compare_gives_nothing():
+    value, index = nearest_of_label(
+        torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(2, 3), torch.tensor([0, 1])
+    )
+    assert len(value) == len(index) == 0
+    assert (
+        len(best_per_group(torch.zeros(0), torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool), count=3))
+        == 0
+    )

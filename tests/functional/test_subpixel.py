@@ -1,0 +1,63 @@
+import torch
+
+from pipeline.functional.similarity import unit
+from pipeline.functional.subpixel import neighbourhood_shift
+
+_CELLS = 24
+
+
+def _field(dx: float = 0.0, dy: float = 0.0) -> torch.Tensor:
+    """Unit features (h w c) of a smooth field seen from (dx, dy) cells aside."""
+    generator = torch.Generator().manual_seed(0)
+    wave, phase = torch.randn(16, 20, 2, generator=generator), 6.28 * torch.rand(16, 20, generator=generator)
+    y, x = torch.meshgrid(torch.arange(_CELLS) + dy, torch.arange(_CELLS) + dx, indexing="ij")
+    waves = torch.einsum("ckd,hwd->hwck", wave, torch.stack([x, y], -1).float())
+    return unit(torch.cos(waves + phase).sum(-1))
+
+
+def _disc() -> torch.Tensor:
+    centre = torch.arange(_CELLS) - (_CELLS - 1) / 2
+    return centre[:, None] ** 2 + centre**2 < 100
+
+
+def test_a_perfect_match_stays_where_it_is_even_at_the_silhouette():
+    template, mask = _field(), _disc()
+    cell = mask.flatten().nonzero()[:, 0]
+    shift = neighbourhood_shift(template.flatten(0, 1)[cell], template, mask, cell, kernel=3)
+    assert shift.abs().max() == 0
+
+
+def test_shift_points_to_where_the_query_lies():
+    template, mask = _field(), torch.ones(_CELLS, _CELLS, dtype=torch.bool)
+    cell = _disc().flatten().nonzero()[:, 0]
+    for dx, dy in ((0.4, 0.0), (0.0, -0.4), (0.3, 0.3)):
+        query = _field(dx, dy).flatten(0, 1)[cell]
+        shift = neighbourhood_shift(query, template, mask, cell, kernel=3)
+        true = torch.tensor([dx, dy])
+        assert (shift - true).norm(dim=1).mean() < 0.75 * true.norm()  # without a shift: true.norm()
+
+
+def test_weighted_mean_equals_a_loop_over_the_neighbourhood():
+    template, mask, query = _field(), _disc(), _field(0.3, 0.1)
+    cell = mask.flatten().nonzero()[::17, 0]
+    found = neighbourhood_shift(query.flatten(0, 1)[cell], template, mask, cell, kernel=3)
+    for i, flat in enumerate(cell.tolist()):
+        y, x = divmod(flat, _CELLS)
+        means = []
+        for feature in (query[y, x], template[y, x]):
+            total, weights = torch.zeros(2), 0.0
+            for oy in (-1, 0, 1):
+                for ox in (-1, 0, 1):
+                    if mask[y + oy, x + ox]:
+                        weight = max(float(feature @ template[y + oy, x + ox]), 0.0)
+                        total, weights = total + weight * torch.tensor([ox, oy]), weights + weight
+            means.append(total / weights)
+        assert torch.allclose(found[i], means[0] - means[1], atol=1e-5)  # float32, another order of sums
+
+
+def test_kernel_of_one_is_off_and_corners_of_the_map_are_safe():
+    template, mask = _field(), torch.ones(_CELLS, _CELLS, dtype=torch.bool)
+    corners = torch.tensor([0, _CELLS - 1, _CELLS * (_CELLS - 1), _CELLS**2 - 1])
+    query = _field(0.4, 0.4).flatten(0, 1)[corners]
+    assert not neighbourhood_shift(query, template, mask, corners, kernel=1).any()
+    assert torch.isfinite(neighbourhood_shift(query, template, mask, corners, kernel=5)).all()

@@ -1,0 +1,101 @@
+import pytest
+import torch
+
+from pipeline.errors import NoPose
+from pipeline.items.features import Clusters, FusedPair
+from pipeline.stages.cluster.kmeans import KMeans
+from pipeline.stages.cluster.one import One
+from pipeline.stages.correspond.cosine import Cosine
+
+H = 20
+
+
+def _smooth(seed: int = 0, shift: float = 0.0) -> torch.Tensor:
+    coarse = torch.randn(1, 16, 8, 8, generator=torch.Generator().manual_seed(seed))
+    axis = (torch.arange(H) + 0.5) / H * 2 - 1
+    y, x = torch.meshgrid(axis, axis + 2 * shift / H, indexing="ij")
+    return torch.nn.functional.grid_sample(coarse, torch.stack([x, y], -1)[None], "bicubic", align_corners=False)[0]
+
+
+def _disc() -> torch.Tensor:
+    centre = torch.arange(H) - (H - 1) / 2
+    return centre[:, None] ** 2 + centre**2 < 50
+
+
+def _pair(shift: float = 0.0, noise: float = 0.0) -> FusedPair:
+    template = _smooth() + noise * torch.randn(16, H, H, generator=torch.Generator().manual_seed(5))
+    return FusedPair(_smooth(shift=shift), template, _disc(), _disc())
+
+
+@pytest.mark.parametrize("kernel", [1, 3, 5])
+@pytest.mark.parametrize("cluster", [One(), KMeans(count=20)], ids=repr)
+def test_query_against_itself_matches_every_point_to_itself(cluster, kernel):
+    pair = _pair()
+    found = Cosine(per_cluster=100, kernel=kernel)(pair, cluster(pair), crop_size=80)
+    assert torch.equal(found.query_px, found.template_px)
+    assert len(found.query_px) == int(pair.query_mask.sum())
+    assert torch.allclose(found.similarity, torch.ones(len(found.similarity)), atol=1e-6)  # float32
+
+
+def test_points_are_cell_centres_in_crop_pixels():
+    pair = _pair()
+    found = Cosine(kernel=1)(pair, One()(pair), crop_size=80)
+    first = _disc().nonzero()[0]
+    expected = [(float(first[1]) + 0.5) * 4 - 0.5, (float(first[0]) + 0.5) * 4 - 0.5]
+    assert expected in found.query_px.tolist()
+
+
+@pytest.mark.parametrize("mutual", [True, False])
+def test_matches_equal_a_loop_over_the_cells_of_paired_clusters(mutual):
+    pair = _pair(shift=0.4, noise=0.3)
+    clusters = KMeans(count=12)(pair)
+    found = Cosine(per_cluster=4, mutual=mutual, kernel=1)(pair, clusters, crop_size=H)
+    q, t = (m.flatten(1).T / m.flatten(1).norm(dim=0)[:, None] for m in (pair.query, pair.template))
+    expected = []
+    for p, (a, b) in enumerate(clusters.pairs.tolist()):
+        rows = (clusters.query_label.flatten() == a).nonzero()[:, 0].tolist()
+        columns = (clusters.template_label.flatten() == b).nonzero()[:, 0].tolist()
+        best = {i: max(columns, key=lambda j, i=i: float(q[i] @ t[j])) for i in rows}
+        back = {j: max(rows, key=lambda i, j=j: float(q[i] @ t[j])) for j in columns}
+        candidates = [(float(q[i] @ t[j]), i, j) for i, j in best.items() if not mutual or back[j] == i]
+        expected += [(p, i, j) for s, i, j in sorted(candidates, reverse=True)[:4] if s > 0]
+    flat = [
+        (px.double().round() @ torch.tensor([1.0, H], dtype=torch.float64)).long().tolist()
+        for px in (found.query_px, found.template_px)
+    ]
+    assert list(zip(found.cluster.tolist(), *flat, strict=True)) == expected
+
+
+def test_subpixel_places_points_nearer_to_the_truth_than_cell_centres():
+    pair = _pair(shift=0.4)
+    truth = torch.tensor([0.4, 0.0])
+    error = {}
+    for kernel in (1, 3):
+        found = Cosine(kernel=kernel)(pair, One()(pair), crop_size=H)
+        error[kernel] = float((found.template_px - found.query_px - truth).norm(dim=1).mean())
+    assert error[3] < 0.95 * error[1]
+
+
+def test_cells_never_match_outside_their_pair_and_query_cells_are_used_once():
+    pair = _pair(shift=0.4, noise=0.3)
+    clusters = KMeans(count=15)(pair)
+    found = Cosine(mutual=False, kernel=1)(pair, clusters, crop_size=H)
+    for side, label, column in (
+        (found.query_px, clusters.query_label, 0),
+        (found.template_px, clusters.template_label, 1),
+    ):
+        x, y = side.round().long().T
+        assert torch.equal(label[y, x], clusters.pairs[found.cluster, column])
+    assert len(found.query_px.unique(dim=0)) == len(found.query_px)
+    assert torch.bincount(found.cluster).max() <= 10
+
+
+def test_nothing_to_match_says_why():
+    pair = _pair()
+    none = torch.zeros(0, 2, dtype=torch.long)
+    one = One()(pair)
+    with pytest.raises(NoPose, match="correspond: 0 cluster pairs, none with cells on both sides"):
+        Cosine()(pair, Clusters(one.query_label, one.template_label, none), crop_size=80)
+    opposite = FusedPair(torch.ones(4, H, H), -torch.ones(4, H, H), _disc(), _disc())
+    with pytest.raises(NoPose, match="correspond: no cells of 1 cluster pairs have a positive cosine"):
+        Cosine()(opposite, one, crop_size=80)

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from pipeline.errors import BadInput, NoPose
+from pipeline.functional.camera import apply
+from pipeline.spec import build
+from pipeline.stages.crop.square import Square
+
+WHOLE = (-0.5, -0.5, 119.5, 89.5)
+
+
+def _scene() -> tuple[np.ndarray, np.ndarray]:
+    """A photograph and a mask with an L of 40 x 50 pixels."""
+    rgb = np.random.default_rng(0).integers(1, 256, (90, 120, 3), dtype=np.uint8)
+    mask = np.zeros((90, 120), bool)
+    mask[20:70, 30:50] = mask[50:70, 30:70] = True
+    return rgb, mask
+
+
+def test_image_enlarged_three_times_gives_the_same_crop():
+    rgb, mask = _scene()
+    crop, crop_mask, A = Square(size=24)(rgb, mask, WHOLE)
+    large, large_mask, A_large = Square(size=24)(*(a.repeat(3, 0).repeat(3, 1) for a in (rgb, mask)), WHOLE)
+    assert np.abs(crop.astype(int) - large).max() <= 1  # float32 sums may round a half the other way
+    assert np.array_equal(crop_mask, large_mask)
+    corner = np.array([[30.0, 20.0]])
+    assert np.allclose(apply(A, corner), apply(A_large, 3 * corner + 1), atol=1e-9)
+
+
+def test_image_moved_by_whole_pixels_gives_the_same_crop():
+    rgb, mask = _scene()
+    moved = (np.pad(rgb, ((7, 0), (11, 0), (0, 0))), np.pad(mask, ((7, 0), (11, 0))))
+    for a, b in zip(Square()(rgb, mask, WHOLE)[:2], Square()(*moved, WHOLE)[:2], strict=True):
+        assert np.abs(a.astype(int) - b).max() <= 1  # A's last bits differ, a half may round the other way
+
+
+def test_mask_fills_the_crop_up_to_the_padding():
+    _, crop_mask, _ = Square(size=120, padding_ratio=1.2)(*_scene(), WHOLE)
+    rows, columns = np.flatnonzero(crop_mask.any(1)), np.flatnonzero(crop_mask.any(0))
+    assert (rows[0], rows[-1]) == (10, 109)  # 50 px of 60 in height
+    assert (columns[0], columns[-1]) == (20, 99)  # 40 px of 60 in width
+
+
+def test_background_never_reaches_the_crop():
+    rgb, mask = _scene()
+    other = np.where(mask[..., None], rgb, 255 - rgb)
+    assert np.array_equal(Square()(rgb, mask, WHOLE)[0], Square()(other, mask, WHOLE)[0])
+    kept = Square(background="keep")
+    assert not np.array_equal(kept(rgb, mask, WHOLE)[0], kept(other, mask, WHOLE)[0])
+
+
+def test_box_counts_only_without_a_mask():
+    rgb, mask = _scene()
+    with_mask = Square()(rgb, mask, (0.0, 0.0, 5.0, 5.0))
+    crop, crop_mask, A = Square()(rgb, None, (29.5, 19.5, 69.5, 69.5))
+    assert np.array_equal(A, with_mask[2])
+    assert crop_mask.sum() > with_mask[1].sum()
+    assert crop[crop_mask].min() > 0
+
+
+def test_object_at_the_border_stays_where_it_is():
+    rgb = np.full((40, 40, 3), 200, np.uint8)
+    mask = np.zeros((40, 40), bool)
+    mask[:10, :10] = True
+    crop, crop_mask, A = Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE)
+    assert np.array_equal(A[:2, 2], [10.5, 10.5])  # two crop pixels a pixel, image edge -0.5 at crop edge 9.5
+    assert not crop[:9].any()
+    assert not crop_mask[:10].any()
+    assert crop_mask[10:30, 10:30].all()
+
+
+@pytest.mark.parametrize(
+    ("mask", "bbox", "reason"),
+    [
+        (np.zeros((90, 120), bool), WHOLE, "mask is empty, needs 1 pixel"),
+        (np.ones((9, 12), bool), WHOLE, "mask is 12 x 9 px, image is 120 x 90 px"),
+        (None, (10.0, 10.0, 10.0, 30.0), "box (10, 10, 10, 30) has no area"),
+        (None, (float("nan"), 0.0, 10.0, 30.0), "box (nan, 0, 10, 30) has no area"),
+        (None, (200.0, 10.0, 210.0, 30.0), "box (200, 10, 210, 30) holds no pixel of the 120 x 90 image"),
+    ],
+)
+def test_nothing_to_crop_says_why(mask, bbox, reason):
+    with pytest.raises(NoPose, match="crop: ") as failure:
+        Square()(_scene()[0], mask, bbox)
+    assert failure.value.reason == reason
+
+
+def test_padding_that_cuts_the_object_is_refused():
+    with pytest.raises(BadInput, match=r"crop.padding_ratio: found 0.9, needs greater than or equal to 1"):
+        build(Square, {"padding_ratio": 0.9}, where="crop")

@@ -1,0 +1,80 @@
+import pytest
+import torch
+
+from pipeline.errors import NoPose
+from pipeline.functional.masks import cell_mask
+from pipeline.stages.match.cosine import Cosine
+from pipeline.stages.match.masked_cosine import MaskedCosine
+
+VARIANTS = [Cosine(top_k=3), *(MaskedCosine(top_k=3, normalise=n) for n in ("intersection", "query", "union"))]
+
+
+def _bank(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.zeros(n, 32, 32, dtype=torch.bool)
+    for i in range(n):
+        mask[i, 4 : 20 + i % 8, 6 : 28 - i % 5] = True
+    return torch.randn(n, 10, 8, 8, generator=generator).half(), mask
+
+
+@pytest.mark.parametrize("match", VARIANTS, ids=repr)
+def test_template_finds_itself_whatever_the_scale_of_its_features(match):
+    bank, mask = _bank()
+    found = match(4 * bank[5].float(), mask[5], bank, mask)
+    assert found.index.tolist()[0] == 5
+    assert found.index.shape == found.score.shape == (3,)
+    assert (found.score.diff() <= 0).all()
+    assert float(found.score[0]) == pytest.approx(1, abs=1e-5)  # float32
+    assert found.margin > 0
+
+
+def test_what_lies_outside_the_masks_changes_nothing_in_the_masked_cosine():
+    bank, mask = _bank()
+    query, background = bank[5].float(), torch.ones(10, 8, 8)
+    other = torch.where(cell_mask(mask[5], cells=8), query, background)
+    first, second = (MaskedCosine()(q, mask[5], bank, mask) for q in (query, other))
+    assert torch.equal(first.index, second.index)
+    assert torch.equal(first.score, second.score)
+
+
+@pytest.mark.parametrize("normalise", ["intersection", "query", "union"])
+def test_masked_cosine_equals_a_loop_over_cells(normalise):
+    bank, mask = _bank(4)
+    mask = mask[:, ::4, ::4].repeat_interleave(4, 1).repeat_interleave(4, 2)  # whole cells
+    query, cells = bank[0].double() + bank[1].double(), mask[:, ::4, ::4]
+    found = MaskedCosine(top_k=4, normalise=normalise)(query, mask[0], bank, mask)
+    for index, score in zip(found.index.tolist(), found.score.tolist(), strict=True):
+        total = 0.0
+        for i, j in (cells[0] & cells[index]).nonzero().tolist():
+            a, b = query[:, i, j], bank[index, :, i, j].double()
+            total += float(a @ b / a.norm() / b.norm())
+        over = {
+            "intersection": cells[0] & cells[index],
+            "query": cells[0],
+            "union": cells[0] | cells[index],
+        }[normalise]
+        assert score == pytest.approx(total / int(over.sum()), abs=1e-5)  # float32
+
+
+def test_of_equal_templates_the_first_wins_and_the_margin_is_to_the_first_left_out():
+    bank, mask = _bank(3)
+    bank, mask = bank.repeat(3, 1, 1, 1), mask.repeat(3, 1, 1)
+    found = Cosine(top_k=3)(bank[1].float(), mask[1], bank, mask)
+    assert found.index.tolist() == [1, 4, 7]
+    assert Cosine(top_k=2)(bank[1].float(), mask[1], bank, mask).margin == 0
+    assert Cosine(top_k=50)(bank[1].float(), mask[1], bank, mask).index.shape == (9,)
+
+
+@pytest.mark.parametrize("match", VARIANTS, ids=repr)
+def test_features_without_content_say_why(match):
+    bank, mask = _bank()
+    with pytest.raises(NoPose, match="match: query and templates share no feature"):
+        match(torch.zeros(10, 8, 8), mask[0], bank, mask)
+    with pytest.raises(NoPose, match="match: features are not finite"):
+        match(torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
+
+
+def test_empty_query_mask_says_why():
+    bank, mask = _bank()
+    with pytest.raises(NoPose, match="match: query mask is empty, needs 1 pixel"):
+        MaskedCosine()(bank[0].float(), torch.zeros(32, 32, dtype=torch.bool), bank, mask)
