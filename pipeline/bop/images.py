@@ -1,0 +1,61 @@
+"""Image files of a BOP dataset as arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+from jaxtyping import Bool, Float32, UInt8
+
+from pipeline.errors import BadInput
+
+
+def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit rgb. Grey gives three equal channels; 16-bit grey is scaled so that 65535 becomes 255; alpha is dropped."""
+    with _open(path) as image:
+        if image.mode.startswith("I"):
+            grey = np.round(np.asarray(image, dtype=np.float64) / 257).clip(0, 255).astype(np.uint8)
+            return np.repeat(grey[..., None], 3, axis=-1)
+        return np.asarray(image.convert("RGB")).copy()
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
+    """True where the file is not black."""
+    with _open(path) as image:
+        values = np.asarray(image)
+    return np.asarray(values.reshape(*values.shape[:2], -1).any(axis=-1))
+
+
+def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
+    """Depth in mm along the optical axis, 0 where unknown: file values times ``depth_scale``."""
+    with _open(path) as image:
+        values = np.asarray(image, dtype=np.float64)
+    if values.ndim != 2:
+        raise BadInput(path, found=f"{values.shape[-1]} channels", needed="a depth image with one channel")
+    return (values * depth_scale).astype(np.float32)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(h, w) from the file's header; the pixels are not read."""
+    try:
+        with PIL.Image.open(path) as image:
+            return image.height, image.width
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+        raise _unreadable(path, error) from None
+
+
+def _open(path: Path) -> PIL.Image.Image:
+    try:
+        image = PIL.Image.open(path)
+        image.load()  # PIL notices a truncated file only when it reads the pixels
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+        raise _unreadable(path, error) from None
+    return image
+
+
+def _unreadable(path: Path, error: Exception) -> BadInput:
+    if isinstance(error, FileNotFoundError):
+        return BadInput(path, found="no such file", needed="an image")
+    found = "no image format known" if isinstance(error, PIL.UnidentifiedImageError) else str(error)
+    return BadInput(path, found=f"a broken image ({found})", needed="a complete PNG, JPEG or TIFF")

@@ -1,0 +1,101 @@
+"""JSON files and their fields, checked where they are read."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.errors import BadInput
+
+
+def read_json(path: Path) -> Any:
+    """Contents of a ``.json`` or ``.json.gz`` file. Raises BadInput, with the line for a syntax error."""
+    try:
+        data = path.read_bytes()
+        text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8")
+    except FileNotFoundError:
+        raise BadInput(path, found="no such file", needed="a JSON file") from None
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        raise BadInput(path, found=f"{type(error).__name__}: {error}", needed="a readable JSON file") from None
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        found = f"invalid JSON at line {error.lineno}, column {error.colno} ({error.msg})"
+        raise BadInput(path, found=found, needed="valid JSON") from None
+    except RecursionError:
+        raise BadInput(path, found="JSON nested too deeply", needed="valid JSON") from None
+
+
+def by_id(path: Path) -> dict[int, Any]:
+    """A JSON object keyed by ids ("17": ...), as scene_camera.json and models_info.json are."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise BadInput(path, found=f"a JSON {_kind(content)}", needed="a JSON object keyed by id")
+    try:
+        return {int(key): value for key, value in content.items()}
+    except ValueError:
+        strange = next(key for key in content if not key.lstrip("-").isdigit())
+        raise BadInput(path, found=f"the key {strange!r}", needed="integer ids as keys") from None
+
+
+def place(path: Path, *, field: str = "", **ids: int) -> str:
+    """Where in a file: ``place(p, scene=2, image=17, field="cam_K")`` is "p, scene 2, image 17, field cam_K"."""
+    parts = [str(path), *(f"{name} {value}" for name, value in ids.items()), *([f"field {field}"] if field else [])]
+    return ", ".join(parts)
+
+
+def get(record: Any, field: str, where: str) -> Any:
+    """A field of a JSON object. Raises BadInput when it is not there."""
+    if not isinstance(record, dict):
+        raise BadInput(where, found=f"a JSON {_kind(record)}", needed=f"a JSON object with the field {field}")
+    if field not in record:
+        raise BadInput(f"{where}, field {field}", found="nothing", needed=f"the field (there: {', '.join(record)})")
+    return record[field]
+
+
+def integer(record: Any, field: str, where: str) -> int:
+    """An integer field."""
+    value = get(record, field, where)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise BadInput(f"{where}, field {field}", found=brief(value), needed="an integer")
+    return value
+
+
+def numbers(record: Any, field: str, count: int, where: str) -> Float[np.ndarray, " n"]:
+    """A field of ``count`` finite numbers."""
+    return vector(get(record, field, where), count, f"{where}, field {field}")
+
+
+def vector(value: Any, count: int, where: str) -> Float[np.ndarray, " n"]:
+    """A JSON list of ``count`` finite numbers."""
+    if not isinstance(value, list) or len(value) != count or not all(is_number(v) for v in value):
+        raise BadInput(where, found=brief(value), needed=f"{count} numbers")
+    array = np.array(value, dtype=np.float64)
+    if not np.isfinite(array).all():
+        at = int(np.flatnonzero(~np.isfinite(array))[0])
+        raise BadInput(where, found=f"{array[at]} at position {at}", needed=f"{count} finite numbers")
+    return array
+
+
+def is_number(value: Any) -> bool:
+    """True for float, and for int that a float can hold; not for bool."""
+    return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 63)
+
+
+def brief(value: Any, *, length: int = 60) -> str:
+    """A value as text of one short line; long lists say how many elements they have."""
+    text = json.dumps(value)
+    if len(text) <= length:
+        return text
+    return f"{text[:length]}... ({len(value)} elements)" if isinstance(value, (list, dict)) else f"{text[:length]}..."
+
+
+def _kind(value: Any) -> str:
+    names = {dict: "object", list: "list", str: "string", bool: "boolean", type(None): "null"}
+    return names.get(type(value), "number")

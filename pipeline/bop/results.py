@@ -1,0 +1,139 @@
+"""poses <-> the results csv of the BOP challenge: ``scene_id,im_id,obj_id,score,R,t,time``."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.bop.scene import rotation_fault
+from pipeline.errors import BadInput
+from pipeline.functional.rigid import rigid
+from pipeline.items.poses import PoseEstimate
+
+COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+_HEADER = ",".join(COLUMNS)
+_SAME_TIME_S = 1e-3  # bop_toolkit lets the times of one image differ by as much
+
+
+@dataclass(frozen=True, eq=False)
+class ResultRow:
+    """One estimated pose, mm. ``time_s``: seconds the whole image took, the same in all its rows; -1 unknown."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    score: float
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    time_s: float
+
+
+def results_name(method: str, dataset: str, split: str = "test") -> str:
+    """The file name BOP asks for, ``<method>_<dataset>-<split>.csv``; a split's sensor ("test_primesense") is left out.
+
+    Raises BadInput for names with an underscore: BOP's tools split the file name there.
+    """
+    for field, name in (("method", method), ("dataset", dataset)):
+        if not name or any(c in "_/\\ \t\n" for c in name):
+            raise BadInput(
+                f"{field} name", found=repr(name), needed="letters, digits and hyphens, no underscore or space"
+            )
+    return f"{method}_{dataset}-{split.split('_')[0]}.csv"
+
+
+def rows_of(
+    estimates: Sequence[PoseEstimate], times_by_image: Mapping[tuple[int, int], float] | None = None
+) -> list[ResultRow]:
+    """Rows of estimates, sorted by scene, image and object, best score first.
+
+    ``times_by_image``: seconds by (scene_id, im_id), -1 (unknown) where it has no entry.
+    """
+    times = times_by_image or {}
+    rows = [
+        ResultRow(e.scene_id, e.im_id, e.obj_id, e.score, e.T_cam_obj, times.get((e.scene_id, e.im_id), -1.0))
+        for e in estimates
+    ]
+    return sorted(rows, key=lambda row: (row.scene_id, row.im_id, row.obj_id, -row.score))
+
+
+def write_results(path: Path, rows: Iterable[ResultRow]) -> None:
+    """Write the csv; a reader sees the whole file or none. Numbers are written so that they read back the same."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes("\n".join([_HEADER, *map(_line, rows), ""]).encode("ascii"))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_results(path: Path) -> list[ResultRow]:
+    """Rows in file order. Raises BadInput naming line and field for the first fault; the header line may be missing."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(path, found=error, needed="a BOP results csv") from None
+    rows: list[ResultRow] = []
+    times: dict[tuple[int, int], float] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or (number == 1 and [c.strip() for c in line.split(",")] == list(COLUMNS)):
+            continue
+        where = f"{path}, line {number}"
+        row = _row(line, where)
+        known = times.setdefault((row.scene_id, row.im_id), row.time_s)
+        if abs(known - row.time_s) > _SAME_TIME_S:
+            found = f"{row.time_s:g} after {known:g} for scene {row.scene_id}, image {row.im_id}"
+            raise BadInput(f"{where}, field time", found=found, needed="one time for all rows of an image")
+        rows.append(row)
+    return rows
+
+
+def _line(row: ResultRow) -> str:
+    R, t = row.T_cam_obj[:3, :3].ravel(), row.T_cam_obj[:3, 3]
+    texts = [" ".join(repr(float(v)) for v in values) for values in (R, t)]
+    ids = [row.scene_id, row.im_id, row.obj_id]
+    return ",".join([*map(str, ids), repr(float(row.score)), *texts, repr(float(row.time_s))])
+
+
+def _row(line: str, where: str) -> ResultRow:
+    cells = line.split(",")
+    if len(cells) != len(COLUMNS):
+        raise BadInput(where, found=f"{len(cells)} columns", needed=f"{len(COLUMNS)}: {_HEADER}")
+    ids = [_id(cell, f"{where}, field {name}") for name, cell in zip(COLUMNS, cells[:3], strict=False)]
+    score, R, t, time_s = (
+        _numbers(cell, count, f"{where}, field {name}")
+        for name, cell, count in zip(COLUMNS[3:], cells[3:], (1, 9, 3, 1), strict=True)
+    )
+    if fault := rotation_fault(R.reshape(3, 3)):
+        raise BadInput(f"{where}, field R", found=fault, needed="a rotation matrix, row by row")
+    if time_s[0] < 0 and time_s[0] != -1:
+        raise BadInput(f"{where}, field time", found=f"{time_s[0]:g}", needed="seconds >= 0, or -1 for unknown")
+    return ResultRow(ids[0], ids[1], ids[2], float(score[0]), rigid(R.reshape(3, 3), t), float(time_s[0]))
+
+
+def _id(cell: str, where: str) -> int:
+    try:
+        value = int(cell)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise BadInput(where, found=repr(cell), needed="an integer >= 0")
+    return value
+
+
+def _numbers(cell: str, count: int, where: str) -> Float[np.ndarray, " n"]:
+    needed = f"{count} finite numbers, separated by spaces" if count > 1 else "a finite number"
+    try:
+        values = [float(part) for part in cell.split()]
+    except ValueError:
+        raise BadInput(where, found=repr(cell[:60]), needed=needed) from None
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise BadInput(
+            where, found=repr(cell[:60]) if len(values) == count else f"{len(values)} numbers", needed=needed
+        )
+    return np.array(values)

@@ -1,0 +1,1 @@
+"""Errors of poses and what follows from them, as bop_toolkit defines them."""

@@ -1,0 +1,75 @@
+"""estimated and true pose -> errors. ``T_est`` and ``T_gt`` are T_cam_obj in mm, ``vertices`` the object's, in mm."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from pipeline.functional.camera import project
+from pipeline.functional.rigid import rotation_angle_deg, transform
+
+Pose = Float[np.ndarray, "4 4"]
+Vertices = Float[np.ndarray, "v 3"]
+_BLOCK_FLOATS = 1 << 22  # coordinates held at once for the symmetries, 32 MiB
+
+
+def rotation_error_deg(T_est: Pose, T_gt: Pose) -> float:
+    """Geodesic angle between the rotations, degrees. Symmetries are not considered.
+
+    bop_toolkit's ``re`` for exact rotations; by atan2, so that LM-O's rotations, orthonormal to 1e-2 only, give no
+    spurious degrees near zero as the arc cosine would.
+    """
+    return float(rotation_angle_deg(T_est[None, :3, :3], T_gt[None, :3, :3])[0])
+
+
+def translation_error_mm(T_est: Pose, T_gt: Pose) -> float:
+    """Distance of the translations, mm: bop_toolkit's ``te``."""
+    return float(np.linalg.norm(T_est[:3, 3] - T_gt[:3, 3]))
+
+
+def add(T_est: Pose, T_gt: Pose, vertices: Vertices) -> float:
+    """Mean distance of corresponding vertices, mm (Hinterstoisser et al., ACCV 2012)."""
+    return float(np.linalg.norm(transform(T_est, vertices) - transform(T_gt, vertices), axis=1).mean())
+
+
+def adi(T_est: Pose, T_gt: Pose, vertices: Vertices) -> float:
+    """Mean distance of each true vertex to the nearest estimated one, mm (Hinterstoisser et al., ACCV 2012)."""
+    distances, _ = cKDTree(transform(T_est, vertices)).query(transform(T_gt, vertices))
+    return float(distances.mean())
+
+
+def mssd(T_est: Pose, T_gt: Pose, vertices: Vertices, symmetries: Float[np.ndarray, "s 4 4"]) -> float:
+    """Maximum symmetry-aware surface distance, mm: over the symmetries, the least of the largest vertex distances.
+
+    Drost et al., ICCVW 2017; Hodan et al., ECCVW 2020, section 2.2.
+    """
+    seen = transform(T_est, vertices)
+    return min(
+        float(np.linalg.norm(_placed(T_gt @ block, vertices) - seen, axis=-1).max(axis=-1).min())
+        for block in _blocks(symmetries, len(vertices))
+    )
+
+
+def mspd(
+    T_est: Pose,
+    T_gt: Pose,
+    K: Float[np.ndarray, "3 3"],
+    vertices: Vertices,
+    symmetries: Float[np.ndarray, "s 4 4"],
+) -> float:
+    """Maximum symmetry-aware projection distance, pixels of the image of K (Hodan et al., ECCVW 2020, section 2.2)."""
+    seen = project(K, transform(T_est, vertices))
+    return min(
+        float(np.linalg.norm(project(K, _placed(T_gt @ block, vertices)) - seen, axis=-1).max(axis=-1).min())
+        for block in _blocks(symmetries, len(vertices))
+    )
+
+
+def _placed(T: Float[np.ndarray, "s 4 4"], vertices: Vertices) -> Float[np.ndarray, "s v 3"]:
+    return vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+
+
+def _blocks(symmetries: Float[np.ndarray, "s 4 4"], vertex_count: int) -> list[Float[np.ndarray, "b 4 4"]]:
+    rows = max(1, _BLOCK_FLOATS // (3 * vertex_count))
+    return [symmetries[i : i + rows] for i in range(0, len(symmetries), rows)]

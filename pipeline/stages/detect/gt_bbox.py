@@ -1,0 +1,49 @@
+"""ground-truth boxes -> detections without masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from pipeline.bop.dataset import Dataset
+from pipeline.bop.jsonio import place
+from pipeline.bop.scene import GroundTruth
+from pipeline.errors import BadInput
+from pipeline.items.views import Detection, Target
+from pipeline.spec import Spec, spec
+from pipeline.stages.detect.annotated import annotated, annotation_files
+
+
+@spec
+class GtBbox(Spec):
+    """Boxes of annotated instances, score 1, the ``inst_count`` most visible of each target.
+
+    ``bbox``: around the visible part, or around the whole silhouette, which may leave the image. An instance
+    without a box is a Detection with a defect.
+    """
+
+    kind: ClassVar[str] = "detect.gt_bbox"
+    version: ClassVar[int] = 1
+
+    bbox: Literal["visib", "obj"] = "visib"
+
+    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+        """Annotations of the scenes."""
+        return annotation_files(dataset, targets)
+
+    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+        """One detection per annotated instance. Raises BadInput for a scene without scene_gt_info.json."""
+        for scene_id in sorted({target.scene_id for target in targets}):
+            path = dataset.scene(scene_id).folder / "scene_gt_info.json"
+            if not path.exists():
+                raise BadInput(
+                    place(path, scene=scene_id), found="no such file", needed=f"bbox_{self.bbox} of instances"
+                )
+        return [self._detection(target, gt) for target in targets for gt in annotated(dataset, target)]
+
+    def _detection(self, target: Target, gt: GroundTruth) -> Detection:
+        box = gt.bbox_visib_xyxy if self.bbox == "visib" else gt.bbox_obj_xyxy
+        defect = None if box else f"bbox_{self.bbox} has no area"
+        at = target.scene_id, target.im_id, target.obj_id
+        return Detection(*at, 1.0, 0.0, box or (0.0, 0.0, 0.0, 0.0), None, gt.gt_id, defect)

@@ -1,0 +1,60 @@
+"""ground-truth masks -> detections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from pipeline.bop.dataset import Dataset
+from pipeline.bop.masks import encode
+from pipeline.bop.scene import GroundTruth
+from pipeline.errors import BadInput
+from pipeline.functional.camera import mask_bbox
+from pipeline.items.views import Detection, Target
+from pipeline.spec import Spec, spec
+from pipeline.stages.detect.annotated import annotated, annotation_files, photographs
+
+
+@spec
+class GtMask(Spec):
+    """Masks of annotated instances, score 1, the ``inst_count`` most visible of each target.
+
+    ``visible``: the visible part (mask_visib/), otherwise the whole silhouette (mask/). A mask that is missing, broken,
+    empty or of another size than its image is a Detection with a defect.
+    """
+
+    kind: ClassVar[str] = "detect.gt_mask"
+    version: ClassVar[int] = 1
+
+    visible: bool = True
+
+    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+        """Annotations of the scenes, the photographs for their size, and the masks that are there."""
+        masks = [
+            dataset.mask_path(target.scene_id, target.im_id, gt.gt_id, visible=self.visible)
+            for target in targets
+            for gt in annotated(dataset, target)
+        ]
+        files = annotation_files(dataset, targets) + photographs(dataset, targets)
+        return files + [path for path in masks if path.exists()]
+
+    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+        """One detection per annotated instance of the targets."""
+        return [self._detection(dataset, target, gt) for target in targets for gt in annotated(dataset, target)]
+
+    def _detection(self, dataset: Dataset, target: Target, gt: GroundTruth) -> Detection:
+        ids = target.scene_id, target.im_id
+        path = dataset.mask_path(*ids, gt.gt_id, visible=self.visible).relative_to(dataset.root)
+        box = gt.bbox_visib_xyxy or (0.0, 0.0, 0.0, 0.0)
+        try:
+            mask = dataset.mask(*ids, gt.gt_id, visible=self.visible)
+        except BadInput as fault:
+            unread = f"{path}: found {fault.found}, needs {fault.needed}"  # the same wherever the dataset lies
+            return Detection(*ids, gt.obj_id, 1.0, 0.0, box, None, gt.gt_id, unread)
+        defect, size_hw = None, dataset.image_size(*ids)
+        if mask.shape != size_hw:
+            defect = f"mask of {list(mask.shape)} where the image is {list(size_hw)} (height, width)"
+        elif not mask.any():
+            defect = "mask is empty"
+        return Detection(*ids, gt.obj_id, 1.0, 0.0, mask_bbox(mask) or box, encode(mask), gt.gt_id, defect)

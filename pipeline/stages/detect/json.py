@@ -1,0 +1,133 @@
+"""detections file -> detections."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pipeline.bop.dataset import Dataset
+from pipeline.bop.jsonio import brief, get, integer, is_number, place, read_json
+from pipeline.bop.masks import area, decode, read_rle
+from pipeline.bop.scene import Box, edges
+from pipeline.digests import file_digest
+from pipeline.errors import BadInput
+from pipeline.functional.camera import mask_bbox
+from pipeline.items.views import Detection, Target
+from pipeline.spec import Positive, Spec, spec
+from pipeline.stages.detect.annotated import photographs
+
+
+@spec
+class Json(Spec):
+    """Detections in the json of BOP's and CNOS's default detections, plain or gzipped.
+
+    A list of {scene_id, image_id, category_id, score, bbox [x, y, w, h], time, segmentation {size, counts}}; ``time``
+    and ``segmentation`` may be missing. Only entries of the targets' images and objects are looked at.
+
+    ``keep``: how many of a target's detections are kept, by score: "inst_count" as the target says, a number, or "all".
+    An entry that cannot be used (``defect`` says why) is kept only where fewer usable ones are left than that.
+    """
+
+    kind: ClassVar[str] = "detect.json"
+    version: ClassVar[int] = 1
+
+    path: str = ""
+    keep: Literal["inst_count", "all"] | Positive = "inst_count"
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe, the file by its bytes."""
+        return super().recipe() | {"path": file_digest(self._file())}
+
+    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+        """The file, and the photographs for their size."""
+        return [self._file(), *photographs(dataset, targets)]
+
+    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+        """The kept detections of each target, best score first. Raises BadInput for a file of another kind."""
+        entries = _by_target(self._file())
+        return [
+            detection
+            for target in targets
+            for detection in self._kept(dataset, target, entries[target.scene_id, target.im_id, target.obj_id])
+        ]
+
+    def _file(self) -> Path:
+        if not self.path:
+            raise BadInput("detect.path", found="''", needed="the path of a detections file (.json or .json.gz)")
+        return Path(self.path).expanduser()
+
+    def _kept(self, dataset: Dataset, target: Target, entries: list[dict[str, Any]]) -> list[Detection]:
+        if not entries:
+            return []
+        size_hw = dataset.image_size(target.scene_id, target.im_id)
+        count = target.inst_count if self.keep == "inst_count" else len(entries) if self.keep == "all" else self.keep
+        usable: list[Detection] = []
+        broken: list[Detection] = []
+        for entry in sorted(entries, key=lambda e: -_score(e)):  # sorted is stable: equal scores in file order
+            detection = _detection(entry, target, size_hw)
+            (broken if detection.defect else usable).append(detection)
+            if len(usable) == count:
+                break
+        return (usable + broken)[:count]
+
+
+def _by_target(path: Path) -> dict[tuple[int, int, int], list[dict[str, Any]]]:
+    entries = read_json(path)
+    if not isinstance(entries, list):
+        raise BadInput(path, found=f"a JSON {type(entries).__name__}", needed="a list of detections")
+    by_target: dict[tuple[int, int, int], list[dict[str, Any]]] = defaultdict(list)
+    for index, entry in enumerate(entries):
+        where = place(path, detection=index)
+        scene_id, im_id, obj_id = (integer(entry, name, where) for name in ("scene_id", "image_id", "category_id"))
+        get(entry, "score", where)
+        if "segmentation" not in entry:
+            get(entry, "bbox", where)
+        by_target[scene_id, im_id, obj_id].append(entry)
+    return by_target
+
+
+def _detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, int]) -> Detection:
+    ids = target.scene_id, target.im_id, target.obj_id
+    score, time = _score(entry), entry.get("time", -1.0)
+    time_s = float(time) if is_number(time) and math.isfinite(time) else -1.0
+    try:
+        if not math.isfinite(score):
+            raise ValueError(f"score is {brief(entry['score'])}, not a finite number")
+        rle = None if entry.get("segmentation") is None else _mask(entry["segmentation"], size_hw)
+        box = _box(entry.get("bbox"), rle, size_hw)
+    except ValueError as fault:
+        return Detection(*ids, score if math.isfinite(score) else 0.0, time_s, (0.0,) * 4, defect=str(fault))
+    return Detection(*ids, score, time_s, box, rle)
+
+
+def _mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
+    rle = read_rle(segmentation, size_hw)
+    if not area(rle):
+        raise ValueError("mask is empty")
+    return rle
+
+
+def _box(bbox_xywh: Any, rle: dict[str, Any] | None, size_hw: tuple[int, int]) -> Box:
+    """Edges of the entry's box, of its mask when it has no box. Raises ValueError."""
+    if bbox_xywh is None and rle is not None:
+        return mask_bbox(decode(rle)) or (0.0,) * 4
+    if not isinstance(bbox_xywh, list) or len(bbox_xywh) != 4 or not all(is_number(v) for v in bbox_xywh):
+        raise ValueError(f"bbox is {brief(bbox_xywh)}, not 4 numbers")
+    if not all(map(math.isfinite, bbox_xywh)):
+        raise ValueError(f"bbox is {bbox_xywh}, not finite")
+    x0, y0, x1, y1 = box = edges([float(v) for v in bbox_xywh])
+    if rle is None and (x1 <= x0 or y1 <= y0):
+        raise ValueError(f"bbox {bbox_xywh} has no area")
+    h, w = size_hw
+    if rle is None and (x1 <= -0.5 or y1 <= -0.5 or x0 >= w - 0.5 or y0 >= h - 0.5):
+        raise ValueError(f"bbox {bbox_xywh} lies outside the image of {w} x {h} (width x height)")
+    return box
+
+
+def _score(entry: dict[str, Any]) -> float:
+    """The entry's score; -inf, so that it comes last, for one that is no finite number."""
+    score = entry["score"]
+    return float(score) if is_number(score) and math.isfinite(score) else -math.inf
