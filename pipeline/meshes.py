@@ -30,13 +30,15 @@ if TYPE_CHECKING:
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga", ".webp", ".gif", ".ppm")
 _MAX_TEXTURE_PX = 16384
+_GUTTER = 8  # texels around a texture in an atlas: enough for a minification by 8
 
 
 def read_mesh(path: Path) -> Mesh:
     """The triangles of a .ply, .obj, .glb, .gltf, .stl or .off file, several geometries as one.
 
-    The file's vertices come first and in its order; where a vertex has several texture coordinates or colours, copies
-    follow. Raises BadInput for a file or companion that is missing or broken, and for a mesh without an extent.
+    A ply's vertices keep their order; where one has several texture coordinates or colours, copies follow after the
+    last. Other formats keep the vertices that faces use, copies beside them. Raises BadInput for a file or companion
+    that is missing or broken, and for a mesh without an extent.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -67,15 +69,18 @@ def write_ply(path: Path, mesh: Mesh) -> None:
 def diameter_mm(mesh: Mesh) -> float:
     """Largest distance between two vertices, exact: both lie on the convex hull."""
     from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial.distance import cdist
 
     points = np.unique(mesh.vertices, axis=0)
     with suppress(QhullError):  # a flat mesh has no hull in space: all pairs are compared
         points = points[ConvexHull(points).vertices]
-    largest = 0.0
-    for row in range(0, len(points), 512):  # 512 rows at a time: a sphere's vertices are all on its hull
-        squared = ((points[row : row + 512, None] - points[None]) ** 2).sum(-1)
-        largest = max(largest, float(squared.max()))
-    return largest**0.5
+    reach = np.linalg.norm(points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=-1)
+    largest = float(cdist(points[[reach.argmax()]], points).max())
+    # the two ends of a longer distance reach at least this far, by the triangle inequality
+    points = points[reach >= (largest - reach.max()) * (1 - 1e-9)]
+    for row in range(0, len(points), 512):  # 512 rows at a time: a sphere's vertices are all left
+        largest = max(largest, float(cdist(points[row : row + 512], points).max()))
+    return largest
 
 
 class _Companions:
@@ -237,8 +242,7 @@ def _from_scene(path: Path, data: bytes, companions: _Companions) -> Mesh:
         io.BytesIO(data),
         file_type=path.suffix.lower().removeprefix("."),
         resolver=resolver,
-        process=False,
-        maintain_order=True,
+        process=False,  # and not maintain_order, which gives a vertex on a seam one of its coordinates at random
     )
     parts = []
     for node in scene.graph.nodes_geometry:
@@ -341,19 +345,20 @@ def _palette(part: Mesh) -> Mesh:
 def _atlas(path: Path, parts: Sequence[Mesh]) -> list[Mesh]:
     """The parts with one texture in common: theirs on top of one another, repeats written out."""
     tiled = [_tiled(path, part) for part in parts]
-    sizes = np.array([texture.shape[:2] for _, texture in tiled])
-    height, width = int(sizes[:, 0].sum()), int(sizes[:, 1].max())
+    # each texture goes on for some texels, as its repeat would, so that neighbours do not bleed into it
+    framed = [np.pad(texture, ((_GUTTER, _GUTTER), (_GUTTER, _GUTTER), (0, 0)), mode="wrap") for _, texture in tiled]
+    height, width = sum(texture.shape[0] for texture in framed), max(texture.shape[1] for texture in framed)
     if max(height, width) > _MAX_TEXTURE_PX:
         found = f"textures that make an atlas of {width} x {height}"
         raise BadInput(path, found=found, needed=f"at most {_MAX_TEXTURE_PX} pixels a side; bake them into one")
     atlas = np.zeros((height, width, 3), dtype=np.uint8)
     placed, top = [], 0
-    for part, (uv, texture) in zip(parts, tiled, strict=True):
+    for part, frame, (uv, texture) in zip(parts, framed, tiled, strict=True):
         h, w = texture.shape[:2]
-        atlas[top : top + h, :w] = texture
-        uv = np.stack([uv[:, 0] * w / width, 1 - (top + (1 - uv[:, 1]) * h) / height], axis=-1)
-        placed.append(replace(part, uv=uv, texture=atlas))
-        top += h
+        atlas[top : top + len(frame), : frame.shape[1]] = frame
+        x, y = _GUTTER + uv[:, 0] * w, top + _GUTTER + (1 - uv[:, 1]) * h
+        placed.append(replace(part, uv=np.stack([x / width, 1 - y / height], axis=-1), texture=atlas))
+        top += len(frame)
     return placed
 
 

@@ -21,18 +21,26 @@ def corner_normals(
 ) -> Float[np.ndarray, "f 3 3"]:
     """Unit normals at each face's corners: smooth, but the face's own where the two differ by more than the crease.
 
-    Smooth is the area-weighted mean over the faces that touch the corner's position, so that copies of a vertex on a
-    texture's seam share it. 0 degrees give flat shading, 180 smooth throughout; a box needs less than 45.
+    Smooth is the mean over the faces that touch the corner's position (copies of a vertex on a texture's seam share
+    it), weighted by the angle that each has there (Thürmer, Wüthrich, JGT 1998), so that the diagonals of a quad do
+    not matter. 0 degrees give flat shading, 180 smooth throughout; a box needs less than 45.
     """
-    flat = face_normals(vertices, faces)
+    flat = _unit(face_normals(vertices, faces))
     _, position = np.unique(vertices, axis=0, return_inverse=True)
     corner = position.reshape(-1)[faces]
-    weights = np.repeat(flat, 3, axis=0)
+    weights = (corner_angles(vertices, faces)[..., None] * flat[:, None]).reshape(-1, 3)
     count = int(corner.max()) + 1
     smooth = np.stack([np.bincount(corner.reshape(-1), weights[:, axis], count) for axis in range(3)], axis=-1)
-    at_corner, own = _unit(smooth)[corner], _unit(flat)[:, None]
+    at_corner, own = _unit(smooth)[corner], flat[:, None]
     agree = (at_corner * own).sum(-1, keepdims=True) >= np.cos(np.radians(crease_deg))
     return np.where(agree & (crease_deg > 0), at_corner, own)
+
+
+def corner_angles(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Angles of each face at its corners, radians."""
+    corner = vertices[faces]
+    onward, back = _unit(np.roll(corner, -1, axis=1) - corner), _unit(np.roll(corner, 1, axis=1) - corner)
+    return np.arccos(np.clip((onward * back).sum(-1), -1, 1))
 
 
 def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -54,7 +62,7 @@ def lit(
     return albedo * gain[..., None]
 
 
-def mip_levels(texture: UInt8[np.ndarray, "H W 3"]) -> tuple[UInt8[np.ndarray, "h w 3"], ...]:
+def mip_levels(texture: UInt8[np.ndarray, "H W 3"]) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
     """The texture and its halvings (box filter), the finest first, down to 4 pixels."""
     from PIL import Image
 
@@ -78,7 +86,7 @@ def texel_density(
 
 
 def texture_colour(
-    levels: Sequence[UInt8[np.ndarray, "h w 3"]], uv: Float[np.ndarray, "n 2"], texels: Float[np.ndarray, " n"]
+    levels: Sequence[UInt8[np.ndarray, "_ _ 3"]], uv: Float[np.ndarray, "n 2"], texels: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Colours (0..255) at ``uv``, bilinear in the mip level nearest to the samples' width in ``texels``."""
     level = np.clip(np.rint(np.log2(np.maximum(texels, 1.0))), 0, len(levels) - 1).astype(int)

@@ -338,21 +338,23 @@ class _Wall:
 
     def depth_mm(self, camera: _Camera) -> Float[np.ndarray, "H W"]:
         """Depth at pixel centres."""
-        return -self.distance_mm / (self._rays(camera) @ self.normal)
+        x, y = _ray_slopes(camera)
+        return -self.distance_mm / (x * self.normal[0] + y * self.normal[1] + self.normal[2])
 
     def albedo(self, camera: _Camera) -> Float32[np.ndarray, "H W 3"]:
         """The picture as the camera sees it, 0..255."""
-        points = self._rays(camera) * self.depth_mm(camera)[..., None]
-        side = self.picture.shape[0]
-        xy = (points[..., :2] / 2400.0 + 0.5) * side  # 2400 mm cover what a wide camera sees
-        x, y = xy[..., 0].astype(np.float32), xy[..., 1].astype(np.float32)
+        depth_mm = self.depth_mm(camera)
+        # 2400 mm of wall to the picture's side cover what a wide camera sees
+        x, y = ((ray * depth_mm / 2400.0 + 0.5) * len(self.picture) for ray in _ray_slopes(camera))
+        x, y = x.astype(np.float32), y.astype(np.float32)
         seen = cv2.remap(self.picture, x, y, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         return np.asarray(seen, dtype=np.float32)
 
-    def _rays(self, camera: _Camera) -> Float[np.ndarray, "H W 3"]:
-        h, w = camera.size_hw
-        px = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1)
-        return np.concatenate([px, np.ones((h, w, 1))], axis=-1) @ np.linalg.inv(camera.K).T
+
+def _ray_slopes(camera: _Camera) -> tuple[Float[np.ndarray, "1 W"], Float[np.ndarray, "H 1"]]:
+    """Slopes x / z and y / z of the rays through the columns and rows of pixels; cameras made here have no skew."""
+    (h, w), K = camera.size_hw, camera.K
+    return (np.arange(w)[None] - K[0, 2]) / K[0, 0], (np.arange(h)[:, None] - K[1, 2]) / K[1, 1]
 
 
 def _picture(rng: Rng, side: int = 1024) -> Float32[np.ndarray, "s s 3"]:
@@ -376,7 +378,7 @@ def _picture(rng: Rng, side: int = 1024) -> Float32[np.ndarray, "s s 3"]:
 def _photograph(things: Sequence[_Thing], wall: _Wall, camera: _Camera, rng: Rng) -> UInt8[np.ndarray, "H W 3"]:
     """The scene at twice the resolution under one light, halved, blurred as a lens does, with sensor noise."""
     h, w = camera.size_hw
-    fine = _Camera(resize_affine(2) @ camera.K, (2 * h, 2 * w))
+    fine = _Camera(resize_affine(2.0) @ camera.K, (2 * h, 2 * w))
     toward = rng.normal(size=3) * [1, 1, 0.6] + [0, -0.6, -1.0]  # the light comes from the viewer's side, often above
     toward /= np.linalg.norm(toward)
     tint = rng.uniform(0.9, 1.1, 3) * rng.uniform(0.85, 1.15)

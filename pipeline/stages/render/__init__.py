@@ -23,5 +23,5 @@ class Renderer(Protocol):
     def render(
         self, mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "n 4 4"], size_hw: tuple[int, int]
     ) -> tuple[UInt8[np.ndarray, "n H W 3"], Float32[np.ndarray, "n H W"]]:
-        """Rgb and depth of the given views. Raises BadInput when this machine cannot run the renderer."""
+        """Colour and depth of the given views. Raises BadInput when this machine cannot run the renderer."""
         ...

@@ -31,7 +31,7 @@ class Auto(Studio):
     def render(
         self, mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "n 4 4"], size_hw: tuple[int, int]
     ) -> tuple[UInt8[np.ndarray, "n H W 3"], Float32[np.ndarray, "n H W"]]:
-        """Rgb and depth (mm) of the given views, from the resolved renderer."""
+        """Colour and depth (mm) of the given views, from the resolved renderer."""
         return self.resolve().render(mesh, K, T_cam_obj, size_hw)
 
 

@@ -47,9 +47,16 @@ class Studio(Spec):
 
 def bounding_sphere(mesh: Mesh) -> tuple[Float[np.ndarray, " 3"], float]:
     """Centre of the bounding box of the mesh's faces, and the distance to their farthest vertex, mm."""
-    used = mesh.vertices[np.unique(mesh.faces)]
+    used = face_vertices(mesh)
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     return centre, float(np.linalg.norm(used - centre, axis=-1).max())
+
+
+def face_vertices(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
+    """The vertices that a face uses: scans keep stray points, which are not drawn."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    return mesh.vertices[used]
 
 
 def subpixels(supersample: int) -> Float[np.ndarray, "s 2"]:

@@ -35,10 +35,10 @@ class Pyrender(Studio):
     def render(
         self, mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "n 4 4"], size_hw: tuple[int, int]
     ) -> tuple[UInt8[np.ndarray, "n H W 3"], Float32[np.ndarray, "n H W"]]:
-        """Rgb and depth (mm) of the given views; rgb is black where depth is 0."""
+        """Colour and depth (mm) of the given views; rgb is black where depth is 0."""
         rgb = np.zeros((len(T_cam_obj), *size_hw, 3), dtype=np.uint8)
         depth_mm = np.zeros((len(T_cam_obj), *size_hw), dtype=np.float32)
-        K_fine = resize_affine(self.supersample) @ K
+        K_fine = resize_affine(float(self.supersample)) @ K
         with _canvas(mesh, self.crease_deg) as canvas:
             for i, T in enumerate(T_cam_obj):
                 depth_mm[i] = canvas.depth_mm(K, T, size_hw)
@@ -73,17 +73,21 @@ class Pyrender(Studio):
 
 
 class _Canvas:
-    """A mesh in an OpenGL context, once with its skin and once with its normals as colours.
+    """A mesh in an OpenGL context three times: with its skin, with its normals as colours, and bare, for depth.
 
-    Vertices are relative to the centre of the mesh, as float32 in the ray caster too.
+    Vertices are relative to the centre of the mesh, as they are in the ray caster.
     """
 
     def __init__(self, gl: Any, mesh: Mesh, crease_deg: float) -> None:
         self.gl = gl
         self.centre, self.radius = bounding_sphere(mesh)
         self.scene = gl.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
-        self.skin = self.scene.add(gl.Mesh([_skin(gl, mesh, mesh.vertices - self.centre)]))
-        corners = (mesh.vertices - self.centre)[mesh.faces].reshape(-1, 3)
+        local = mesh.vertices - self.centre
+        self.skin = self.scene.add(gl.Mesh([_skin(gl, mesh, local)]))
+        # pyrender culls back faces in its segmentation pass, the one for depth: each face is there both ways round
+        both_sides = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
+        self.bare = self.scene.add(gl.Mesh([gl.Primitive(local, indices=both_sides)]))
+        corners = local[mesh.faces].reshape(-1, 3)
         coded = (corner_normals(mesh.vertices, mesh.faces, crease_deg=crease_deg).reshape(-1, 3) + 1) / 2
         opaque = np.concatenate([coded, np.ones((len(coded), 1))], axis=-1).astype(np.float32)
         self.normals = self.scene.add(gl.Mesh([gl.Primitive(corners, color_0=opaque, material=_two_sided(gl))]))
@@ -95,9 +99,9 @@ class _Canvas:
     ) -> Float32[np.ndarray, "H W"]:
         """Depth at pixel centres."""
         self._aim(K, T_cam_obj, size_hw)
-        self.skin.mesh.is_visible = True
-        flags = self.gl.RenderFlags.SEG | self.gl.RenderFlags.SKIP_CULL_FACES
-        _, depth = self.renderer.render(self.scene, flags=flags, seg_node_map={self.skin: (255, 255, 255)})
+        self._show(self.bare)
+        colour = {self.bare: (255, 255, 255)}
+        _, depth = self.renderer.render(self.scene, flags=self.gl.RenderFlags.SEG, seg_node_map=colour)
         return np.asarray(depth, dtype=np.float32)
 
     def albedo_and_normal(
@@ -108,9 +112,13 @@ class _Canvas:
         flags = self.gl.RenderFlags.FLAT | self.gl.RenderFlags.RGBA | self.gl.RenderFlags.SKIP_CULL_FACES
         layers = []
         for node in (self.skin, self.normals):
-            self.skin.mesh.is_visible, self.normals.mesh.is_visible = node is self.skin, node is self.normals
+            self._show(node)
             layers.append(self.renderer.render(self.scene, flags=flags)[0].astype(np.float64))
         return layers[0], layers[1]
+
+    def _show(self, only: Any) -> None:
+        for node in (self.skin, self.normals, self.bare):
+            node.mesh.is_visible = node is only
 
     def _aim(self, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"], size_hw: tuple[int, int]) -> None:
         self.renderer.viewport_height, self.renderer.viewport_width = size_hw

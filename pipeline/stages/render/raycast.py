@@ -20,7 +20,7 @@ from pipeline.functional.rigid import transform
 from pipeline.functional.shading import PLAIN, corner_normals, lit, mip_levels, texel_density, texture_colour
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
-from pipeline.stages.render.cameras import Studio, bounding_sphere, subpixels
+from pipeline.stages.render.cameras import Studio, bounding_sphere, face_vertices, subpixels
 
 
 @spec
@@ -33,7 +33,7 @@ class Raycast(Studio):
     def render(
         self, mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "n 4 4"], size_hw: tuple[int, int]
     ) -> tuple[UInt8[np.ndarray, "n H W 3"], Float32[np.ndarray, "n H W"]]:
-        """Rgb and depth (mm) of the given views; rgb is black where depth is 0."""
+        """Colour and depth (mm) of the given views; rgb is black where depth is 0."""
         rgb = np.zeros((len(T_cam_obj), *size_hw, 3), dtype=np.uint8)
         depth_mm = np.zeros((len(T_cam_obj), *size_hw), dtype=np.float32)
         for i, T in enumerate(T_cam_obj):
@@ -125,7 +125,7 @@ class _Caster:
     def __init__(self, mesh: Mesh) -> None:
         scene, triangles = _embree()
         self.centre, self.radius = bounding_sphere(mesh)
-        used = mesh.vertices[np.unique(mesh.faces)]
+        used = face_vertices(mesh)
         self.box = np.array(list(product(*zip(used.min(axis=0), used.max(axis=0), strict=True))))
         self.scene = scene(robust=True)
         local = (mesh.vertices - self.centre).astype(np.float32)
