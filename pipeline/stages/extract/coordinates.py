@@ -1,0 +1,101 @@
+"""crops, geometry -> object coordinates as features: an oracle, under which every pose error is a geometry error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from pydantic import Field
+
+from pipeline.errors import BadInput
+from pipeline.functional import camera, rigid
+from pipeline.items.features import FeatureMaps
+from pipeline.items.views import Crops
+from pipeline.spec import NonNegative, PositiveFloat, Runtime, Spec, spec
+from pipeline.stages.extract.grid import cells_of
+
+
+@spec
+class Coordinates(Spec):
+    """Random Fourier features of the object point that each cell's centre sees; background cells are zero.
+
+    The cosine of two cells d mm apart on the object is exp(-d^2 / (2 bandwidth_mm^2)) in expectation over the
+    frequencies (Rahimi and Recht, NeurIPS 2007), with a standard error of at most channels^(-1/2).
+    """
+
+    kind: ClassVar[str] = "extract.coordinates"
+    version: ClassVar[int] = 1
+    needs_geometry: ClassVar[bool] = True
+    model: ClassVar[str] = "coordinates"
+    timestep: ClassVar[int] = 0
+
+    bandwidth_mm: PositiveFloat = 10.0
+    channels: Annotated[int, Field(ge=2, multiple_of=2)] = 128
+    seed: NonNegative = 0
+
+    def feature_shape(self, layer: int) -> tuple[int, int, int]:
+        """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
+        return self.channels, cells_of(layer), cells_of(layer)
+
+    def load(self, runtime: Runtime) -> CoordinatesBackbone:
+        """Nothing to load."""
+        return CoordinatesBackbone(self, runtime)
+
+
+class CoordinatesBackbone:
+    """A Coordinates spec with its frequencies drawn."""
+
+    def __init__(self, spec: Coordinates, runtime: Runtime) -> None:
+        self.device, self.batch = torch.device(runtime.torch_device()), runtime.batch or 64
+        draws = np.random.default_rng(spec.seed).standard_normal((3, spec.channels // 2))
+        self.frequencies = draws / spec.bandwidth_mm
+
+    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of the given layers, float32. Raises BadInput for crops without geometry."""
+        return {layer: torch.from_numpy(self._maps(crops, cells_of(layer))).to(self.device) for layer in layers}
+
+    def _maps(self, crops: Crops, cells: int) -> Float32[np.ndarray, "n c h w"]:
+        points = [cell_points(crops, i, cells=cells) for i in range(len(crops))]
+        features = np.stack([fourier_features(xyz, self.frequencies) * seen[:, None] for xyz, seen in points])
+        return features.reshape(len(crops), cells, cells, -1).transpose(0, 3, 1, 2).astype(np.float32)
+
+
+def cell_points(crops: Crops, i: int, *, cells: int) -> tuple[Float[np.ndarray, "hw 3"], Bool[np.ndarray, " hw"]]:
+    """Object points (mm) at the cell centres of crop i, rows first, and which cells see the object.
+
+    The ray is that of the exact centre, its depth the nearest pixel's, as in ``lift``.
+    """
+    if crops.geometry is None:
+        needed = "depth, camera and pose of every view, which templates and ground truth have"
+        raise BadInput("extract=coordinates", found="crops without geometry", needed=needed)
+    depth_mm, size = crops.geometry.depth_mm[i], crops.mask.shape[-1]
+    grid = np.stack(np.meshgrid(np.arange(cells), np.arange(cells)), axis=-1).reshape(-1, 2)
+    px_crop = camera.cell_to_px(torch.from_numpy(grid).double(), size=size, cells=cells).numpy()
+    px_img = camera.apply(np.linalg.inv(crops.A_crop_img[i]), px_crop)
+    depth = nearest(depth_mm, px_img, outside=0.0)
+    seen = nearest(crops.mask[i], px_crop, outside=False) & (depth > 0)
+    points_cam = camera.unproject(crops.geometry.K[i], px_img, depth)
+    return rigid.transform(rigid.inverse(crops.geometry.T_cam_obj[i]), points_cam), seen
+
+
+def nearest(
+    values: Float32[np.ndarray, "H W"] | Bool[np.ndarray, "H W"], px: Float[np.ndarray, "m 2"], *, outside: float | bool
+) -> np.ndarray:
+    """Values at the pixels that contain the points; ``outside`` where there is none."""
+    column, row = np.floor(px + 0.5).astype(int).T
+    height, width = values.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = np.full(len(px), outside, dtype=values.dtype)
+    found[inside] = values[row[inside], column[inside]]
+    return found
+
+
+def fourier_features(
+    points: Float[np.ndarray, "m 3"], frequencies: Float[np.ndarray, "3 half"]
+) -> Float[np.ndarray, "m c"]:
+    """(cos w.x, sin w.x) over all w, of unit length."""
+    phase = points @ frequencies
+    return np.concatenate([np.cos(phase), np.sin(phase)], axis=1) / np.sqrt(frequencies.shape[1])

@@ -1,0 +1,198 @@
+"""crops -> feature maps of a latent diffusion model's decoder, whatever its weights.
+
+Tang et al., NeurIPS 2023 (DIFT) and Zhang et al., NeurIPS 2023 (A Tale of Two Features): encode the image, noise the
+latent once, run the U-Net once, read its decoder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import psutil
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from pipeline.errors import BadInput
+from pipeline.items.features import FeatureMaps
+from pipeline.items.views import Crops
+from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
+from pipeline.stages.extract.decoder import Hook, block_count, decoder_maps, map_shape
+from pipeline.stages.extract.noise import NoiseMode, draw, noised
+
+_CPU_WORKING_BYTES = 1 << 30  # keeps all of SD 1.5 in float32 under 6 GB; larger batches gain nothing on a CPU
+_MOST_CROPS = {"cpu": 16, "cuda": 64}
+
+
+@dataclass(frozen=True, eq=False)
+class Architecture:
+    """What is known of a model before its weights: the configs of U-Net and VAE as diffusers has them, and abar_t."""
+
+    unet: Mapping[str, Any]
+    vae: Mapping[str, Any]
+    alphas_cumprod: Float[np.ndarray, " timesteps"]
+
+    @property
+    def vae_factor(self) -> int:
+        """Image pixels per latent cell, along a side."""
+        return 1 << (len(self.vae["block_out_channels"]) - 1)
+
+    @property
+    def size_step(self) -> int:
+        """Input sizes must be multiples of this, or maps of encoder and decoder do not meet."""
+        return self.vae_factor << (len(self.unet["block_out_channels"]) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedModel:
+    """A diffusion model in memory, on the CPU, in the spec's dtype. ``prompt``: the text embedding (1 l d)."""
+
+    unet: nn.Module
+    vae: nn.Module
+    prompt: Float[Tensor, "1 l d"]
+
+
+@spec
+class DiffusionFeatures(Spec):
+    """The parameters that all latent diffusion extractors share.
+
+    ``hook`` picks one of three readings of "layer k", see ``decoder.tapped_module``. ``noise`` "none" passes the clean
+    latent, neither noised nor scaled, at the same timestep. ``ensemble`` averages the features over the noises of
+    ``seed``, ``seed`` + 1, ...
+    """
+
+    needs_geometry: ClassVar[bool] = False
+
+    hook: Hook = "pre"
+    input_size: Positive = 512
+    timestep: NonNegative = 50
+    noise: NoiseMode = "shared"
+    seed: NonNegative = 0
+    ensemble: Positive = 1
+    dtype: Dtype = "float32"
+
+    def architecture(self) -> Architecture:
+        """Configs alone; no weights are loaded."""
+        raise NotImplementedError
+
+    def load_model(self) -> LoadedModel:
+        """Weights into memory."""
+        raise NotImplementedError
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe; without noise, neither its seed nor the size of its ensemble can matter."""
+        return super().recipe() | ({"seed": 0, "ensemble": 1} if self.noise == "none" else {})
+
+    def feature_shape(self, layer: int) -> tuple[int, int, int]:
+        """(c, h, w) of one crop's map. Raises BadInput for a layer, timestep or input size the model does not have."""
+        architecture = self.architecture()
+        _check(self, architecture, (layer,))
+        latent_size = self.input_size // architecture.vae_factor
+        return map_shape(architecture.unet, layer=layer, hook=self.hook, latent_size=latent_size)
+
+    def load(self, runtime: Runtime) -> DiffusionBackbone:
+        """Weights into memory. Raises BadInput for weights that are missing or of another class."""
+        architecture = self.architecture()
+        _check(self, architecture, ())
+        device = torch.device(runtime.torch_device())
+        model = self.load_model()
+        placed = LoadedModel(_ready(model.unet, device), _ready(model.vae, device), model.prompt.to(device))
+        return DiffusionBackbone(
+            self, architecture, placed, runtime.batch or _fitting_batch(self, architecture, device)
+        )
+
+
+class DiffusionBackbone:
+    """A DiffusionFeatures spec with its model in memory."""
+
+    def __init__(self, spec: DiffusionFeatures, architecture: Architecture, model: LoadedModel, batch: int) -> None:
+        self.spec, self.architecture, self.model, self.batch = spec, architecture, model, batch
+
+    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of the given layers in the spec's dtype, on the model's device; at most ``batch`` crops at a time."""
+        _check(self.spec, self.architecture, layers)
+        chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
+        # concatenated outside inference mode: the maps are ordinary tensors again, free for use in place
+        return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
+
+    @torch.inference_mode()
+    def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            latent = self._latent(crops.rgb)
+            members = 1 if self.spec.noise == "none" else self.spec.ensemble
+            return _mean([self._maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
+
+    def _latent(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n c h w"]:
+        # one by one on the CPU, where a batch gains nothing and the VAE's first maps are the largest of all
+        step = 1 if self.model.prompt.device.type == "cpu" else len(rgb)
+        images = [self._image(rgb[i : i + step]) for i in range(0, len(rgb), step)]
+        return torch.cat([clean_latent(self.model.vae, self.architecture.vae, image) for image in images])
+
+    def _image(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n 3 H W"]:
+        image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self.model.prompt.device)
+        return network_image(image, size=self.spec.input_size).to(self.model.prompt.dtype)
+
+    def _maps(self, crops: Crops, latent: Float[Tensor, "n c h w"], seed: int, layers: Sequence[int]) -> FeatureMaps:
+        s = self.spec
+        if s.noise != "none":
+            shape = (latent.shape[1], latent.shape[2], latent.shape[3])
+            noise = draw(s.noise, crops.rgb, crops.mask, seed=seed, shape=shape).to(latent)
+            latent = noised(latent, noise, alpha_cumprod=float(self.architecture.alphas_cumprod[s.timestep]))
+        return decoder_maps(self.model.unet, latent, s.timestep, self.model.prompt, layers=layers, hook=s.hook)
+
+
+def network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tensor, "n 3 H W"]:
+    """Images in [-1, 1], resized with pixel edges on pixel edges (camera.resize_affine); shrinking is antialiased."""
+    image = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1
+    if image.shape[-1] == size:
+        return image
+    return interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=image.shape[-1] > size)
+
+
+def clean_latent(vae: Any, config: Mapping[str, Any], image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
+    """(posterior mean - shift_factor) times scaling_factor (Rombach et al., CVPR 2022, App. G); no draw."""
+    mean = vae.encode(image).latent_dist.mean
+    return (mean - (config.get("shift_factor") or 0.0)) * config.get("scaling_factor", 0.18215)
+
+
+def _mean(members: Sequence[FeatureMaps]) -> FeatureMaps:
+    if len(members) == 1:
+        return members[0]
+    return {k: torch.stack([maps[k].float() for maps in members]).mean(0).to(members[0][k].dtype) for k in members[0]}
+
+
+def _ready(model: Any, device: torch.device) -> nn.Module:
+    model.eval().requires_grad_(False)
+    if device.type == "cuda":
+        return model.to(device, memory_format=torch.channels_last)
+    return model.to(device)
+
+
+def _check(spec: DiffusionFeatures, architecture: Architecture, layers: Sequence[int]) -> None:
+    blocks, timesteps, step = block_count(architecture.unet), len(architecture.alphas_cumprod), architecture.size_step
+    for layer in layers:
+        if not 0 <= layer < blocks:
+            raise BadInput("extract layer", found=layer, needed=f"0..{blocks - 1}, the U-Net's {blocks} decoder blocks")
+    if spec.timestep >= timesteps:
+        raise BadInput("extract.timestep", found=spec.timestep, needed=f"0..{timesteps - 1}, as the model was trained")
+    if spec.input_size % step:
+        raise BadInput(
+            "extract.input_size", found=spec.input_size, needed=f"a multiple of {step} pixels for this model"
+        )
+
+
+def _fitting_batch(spec: DiffusionFeatures, architecture: Architecture, device: torch.device) -> int:
+    """Crops per pass from free memory, by the largest maps: the VAE's first level, the U-Net's first with its skips."""
+    bytes_per_value = 4 if spec.dtype == "float32" else 2
+    latent_size = spec.input_size // architecture.vae_factor
+    unet = 60 * architecture.unet["block_out_channels"][0] * latent_size**2 * bytes_per_value
+    vae = 6 * architecture.vae["block_out_channels"][0] * spec.input_size**2 * bytes_per_value
+    if device.type == "cuda":
+        fitting = int(0.6 * torch.cuda.mem_get_info(device)[0]) // (vae + unet)
+    else:
+        fitting = min(psutil.virtual_memory().available // 4, _CPU_WORKING_BYTES) // unet
+    return max(1, min(fitting, _MOST_CROPS[device.type]))

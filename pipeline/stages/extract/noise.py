@@ -1,0 +1,47 @@
+"""The one noising step of diffusion features: which noise, and how much of it."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+NoiseMode = Literal["shared", "independent", "none"]
+
+
+def draw(
+    mode: Literal["shared", "independent"],
+    rgb: UInt8[np.ndarray, "n S S 3"],
+    mask: Bool[np.ndarray, "n S S"],
+    *,
+    seed: int,
+    shape: tuple[int, int, int],
+) -> Float[Tensor, "n c h w"]:
+    """Unit Gaussian noise for n crops, drawn on the CPU so that every device gets the same numbers.
+
+    ``shared``: one tensor for all crops. ``independent``: a crop's own content seeds its noise, so neither the batch
+    nor the order of the crops can change it.
+    """
+    if mode == "shared":
+        return _gaussian(seed, shape).expand(len(rgb), *shape)
+    return torch.stack([_gaussian(_content_seed(seed, rgb[i], mask[i]), shape) for i in range(len(rgb))])
+
+
+def noised(
+    latent: Float[Tensor, "n c h w"], noise: Float[Tensor, "n c h w"], *, alpha_cumprod: float
+) -> Float[Tensor, "n c h w"]:
+    """sqrt(abar_t) z + sqrt(1 - abar_t) eps (Ho et al., NeurIPS 2020, Eq. 4)."""
+    return alpha_cumprod**0.5 * latent + (1 - alpha_cumprod) ** 0.5 * noise
+
+
+def _gaussian(seed: int, shape: tuple[int, int, int]) -> Float[Tensor, "c h w"]:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _content_seed(seed: int, rgb: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> int:
+    content = sha256(f"{seed}\0".encode() + rgb.tobytes() + mask.tobytes()).digest()
+    return int.from_bytes(content[:8], "little") >> 1  # torch takes 63 bits

@@ -1,0 +1,113 @@
+"""crops -> feature maps of a small U-Net of Stable Diffusion's architecture with random weights: a control.
+
+It is not Stable Diffusion and has learned nothing; what it scores is what convolutions alone are worth.
+"""
+
+from __future__ import annotations
+
+import math
+from hashlib import sha256
+from typing import Annotated, Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from pipeline.spec import NonNegative, Positive, digest, spec
+from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.stages.extract.weights import alphas_cumprod, empty_model, without_decoder
+
+_PROMPT_TOKENS = 77
+_GROUPS = 8  # of every group norm
+
+Width = Annotated[int, Field(ge=_GROUPS, multiple_of=_GROUPS)]
+
+
+@spec
+class RandomSD(DiffusionFeatures):
+    """Random weights, drawn in memory from ``weights_seed``: a control, not Stable Diffusion.
+
+    The classes of diffusers and 12 decoder blocks as in SD; only the widths differ: ``channels`` of the U-Net's levels,
+    ``vae_channels`` of the encoder's, whose count sets the VAE's factor (3 levels: 4 pixels per latent cell).
+    """
+
+    kind: ClassVar[str] = "extract.random_sd"
+    version: ClassVar[int] = 1
+
+    input_size: Positive = 128
+    channels: tuple[Width, Width, Width, Width] = (32, 64, 128, 128)
+    vae_channels: Annotated[tuple[Width, ...], Field(min_length=1)] = (32, 32, 32)
+    cross_attention_dim: Positive = 32
+    weights_seed: NonNegative = 0
+
+    @property
+    def model(self) -> str:
+        """``random_sd-`` and 8 digits of the digest of widths and seed."""
+        a = self.architecture()
+        return f"random_sd-{digest([self.version, a.unet, a.vae, self.weights_seed])[:8]}"
+
+    def architecture(self) -> Architecture:
+        """Configs with the spec's widths and Stable Diffusion's noise schedule."""
+        return Architecture(
+            unet_config(self.channels, self.cross_attention_dim), vae_config(self.vae_channels), alphas_cumprod({})
+        )
+
+    def load_model(self) -> LoadedModel:
+        """The same weights on every machine and in every run."""
+        from diffusers import AutoencoderKL, UNet2DConditionModel
+
+        a, dtype = self.architecture(), getattr(torch, self.dtype)
+        unet = with_random_weights(empty_model(UNet2DConditionModel, a.unet, dtype), seed=self.weights_seed)
+        vae = with_random_weights(without_decoder(empty_model(AutoencoderKL, a.vae, dtype)), seed=self.weights_seed)
+        prompt = _gaussian("prompt", (1, _PROMPT_TOKENS, self.cross_attention_dim), seed=self.weights_seed)
+        return LoadedModel(unet, vae, prompt.to(dtype))
+
+
+def unet_config(channels: tuple[int, ...], cross_attention_dim: int) -> dict[str, Any]:
+    """A UNet2DConditionModel like SD 1.x's: attention on all levels but the coarsest."""
+    levels = len(channels)
+    return {
+        "block_out_channels": channels,
+        "layers_per_block": 2,
+        "cross_attention_dim": cross_attention_dim,
+        "attention_head_dim": [max(1, c // 32) for c in channels],  # how diffusers spells the number of heads
+        "norm_num_groups": _GROUPS,
+        "down_block_types": ("CrossAttnDownBlock2D",) * (levels - 1) + ("DownBlock2D",),
+        "up_block_types": ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * (levels - 1),
+    }
+
+
+def vae_config(channels: tuple[int, ...]) -> dict[str, Any]:
+    """An AutoencoderKL like SD's."""
+    return {
+        "block_out_channels": channels,
+        "layers_per_block": 1,
+        "norm_num_groups": _GROUPS,
+        "latent_channels": 4,
+        "scaling_factor": 1.0,
+        "down_block_types": ("DownEncoderBlock2D",) * len(channels),
+        "up_block_types": ("UpDecoderBlock2D",) * len(channels),
+    }
+
+
+def with_random_weights(model: nn.Module, *, seed: int) -> nn.Module:
+    """A model whose weights depend on ``seed`` and their own names alone, not on the order a library makes them in.
+
+    Matrices and kernels: Gaussian of variance 1 / fan-in, which keeps the size of activations. Norms: the identity.
+    """
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            parameter.copy_(_initial(name, tuple(parameter.shape), seed=seed))
+    return model
+
+
+def _initial(name: str, shape: tuple[int, ...], *, seed: int) -> Tensor:
+    if len(shape) > 1:
+        return _gaussian(name, shape, seed=seed) / math.prod(shape[1:]) ** 0.5
+    return torch.ones(shape) if name.endswith("weight") else torch.zeros(shape)
+
+
+def _gaussian(name: str, shape: tuple[int, ...], *, seed: int) -> Float[Tensor, "*shape"]:
+    key = int.from_bytes(sha256(f"{seed}\0{name}".encode()).digest()[:8], "little") >> 1
+    return torch.randn(shape, generator=torch.Generator().manual_seed(key))

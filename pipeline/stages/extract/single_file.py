@@ -1,0 +1,220 @@
+"""One .safetensors file in the layout of CompVis and Stability: configs are read off the shapes of its tensors."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.errors import BadInput
+from pipeline.stages.extract.diffusion import Architecture
+from pipeline.stages.extract.weights import (
+    alphas_cumprod,
+    check_latents,
+    check_missing,
+    copy_weight,
+    empty_model,
+    empty_prompt,
+    empty_text_encoder,
+    last_hidden_state,
+    tensor_shapes,
+    without_decoder,
+)
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+_UNET, _VAE = "model.diffusion_model.", "first_stage_model."
+_CLIP, _OPEN_CLIP = "cond_stage_model.transformer.", "cond_stage_model.model."
+_HEADS_SD1 = 8  # SD 1.x: 8 heads on every level (v1-inference.yaml, num_heads)
+_HEAD_WIDTH_SD2 = 64  # SD 2.x: heads of 64 channels (v2-inference.yaml, num_head_channels)
+_CLIP_HEAD_WIDTH = 64  # of every text encoder of CLIP and OpenCLIP
+_OPEN_CLIP_NAMES = {
+    "ln_1": "layer_norm1",
+    "ln_2": "layer_norm2",
+    "mlp.c_fc": "mlp.fc1",
+    "mlp.c_proj": "mlp.fc2",
+    "attn.out_proj": "self_attn.out_proj",
+}
+
+
+@dataclass(frozen=True)
+class SingleFile:
+    """Weights of U-Net, VAE and text encoder in one file; see weights.Weights."""
+
+    path: Path
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The file."""
+        return {"model.safetensors": self.path}
+
+    @cached_property
+    def shapes(self) -> Shapes:
+        """Shapes by tensor name, checked to be of the original layout."""
+        shapes = tensor_shapes(self.path)
+        for prefix in (_UNET, _VAE, "cond_stage_model."):
+            if not any(name.startswith(prefix) for name in shapes):
+                needed = "a whole Stable Diffusion 1.x or 2.x checkpoint in the original layout"
+                raise BadInput(self.path, found=f"no tensor {prefix}*", needed=needed)
+        return shapes
+
+    def architecture(self) -> Architecture:
+        """Configs that the shapes imply; the noise schedule is Stable Diffusion's."""
+        try:
+            unet, vae = unet_config(below(self.shapes, _UNET)), vae_config(below(self.shapes, _VAE))
+        except KeyError as error:
+            needed = "the tensors of Stable Diffusion 1.x or 2.x"
+            raise BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed) from None
+        if "label_emb.0.0.weight" in below(self.shapes, _UNET):
+            raise BadInput(self.path, found=f"{_UNET}label_emb", needed="Stable Diffusion 1.x or 2.x, not XL")
+        check_latents(unet, vae, self.path)
+        return Architecture(unet, vae, alphas_cumprod({}))
+
+    def unet(self, dtype: torch.dtype) -> nn.Module:
+        """See Weights."""
+        from diffusers import UNet2DConditionModel
+        from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
+
+        config = self.architecture().unet
+        model = empty_model(UNet2DConditionModel, config, dtype, self.path)
+        return self._filled(model, convert_ldm_unet_checkpoint(self._tensors(_UNET), dict(config)))
+
+    def vae(self, dtype: torch.dtype) -> nn.Module:
+        """See Weights."""
+        from diffusers import AutoencoderKL
+        from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
+
+        config = self.architecture().vae
+        model = without_decoder(empty_model(AutoencoderKL, config, dtype, self.path))
+        return self._filled(model, convert_ldm_vae_checkpoint(self._tensors(_VAE), dict(config)))
+
+    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+        """See Weights; there is no tokenizer in such a file, so the text can only be empty."""
+        is_open = any(name.startswith(_OPEN_CLIP) for name in self.shapes)
+        prefix = _OPEN_CLIP if is_open else _CLIP
+        state = {name.removeprefix(prefix): tensor for name, tensor in self._tensors(prefix).items()}
+        try:
+            state = open_clip_as_clip(state) if is_open else _unwrapped(state)
+            config = text_config({name: tuple(t.shape) for name, t in state.items()}, open_clip=is_open)
+        except KeyError as error:
+            needed = "the text encoder of CLIP or OpenCLIP"
+            raise BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed) from None
+        ids = empty_prompt(text, self.path, open_clip=is_open, length=config["max_position_embeddings"])
+        outer, inner = empty_text_encoder(config, self.path)
+        self._filled(inner, state)
+        return last_hidden_state(outer, ids)
+
+    def _filled(self, model: nn.Module, state: Mapping[str, Tensor]) -> nn.Module:
+        missing = dict(model.named_parameters())
+        with torch.no_grad():
+            for name in missing.keys() & state.keys():
+                copy_weight(state[name], missing.pop(name), f"{self.path}, tensor {name}")
+        check_missing(sorted(missing), self.path)
+        return model
+
+    def _tensors(self, prefix: str) -> dict[str, Tensor]:
+        from safetensors import safe_open
+
+        with safe_open(str(self.path), framework="pt") as tensors:
+            return {name: tensors.get_tensor(name) for name in self.shapes if name.startswith(prefix)}
+
+
+def below(shapes: Shapes, prefix: str) -> Shapes:
+    """Shapes under a prefix, without it."""
+    return {name.removeprefix(prefix): shape for name, shape in shapes.items() if name.startswith(prefix)}
+
+
+def unet_config(shapes: Shapes) -> dict[str, Any]:
+    """Config of a UNet2DConditionModel whose input blocks are, level by level, resnets and then a downsampler."""
+    levels: list[list[int]] = [[]]
+    attends: list[bool] = [False]
+    for block in range(1, 1 + _highest(shapes, r"input_blocks\.(\d+)\.")):
+        if f"input_blocks.{block}.0.op.weight" in shapes:
+            levels.append([])
+            attends.append(False)
+        else:
+            levels[-1].append(shapes[f"input_blocks.{block}.0.in_layers.2.weight"][0])
+            attends[-1] |= f"input_blocks.{block}.1.norm.weight" in shapes
+    channels = [level[-1] for level in levels]
+    middle = "middle_block.1.transformer_blocks.0.attn2.to_k.weight"
+    linear = len(shapes["middle_block.1.proj_in.weight"]) == 2
+    return {
+        "_class_name": "UNet2DConditionModel",
+        "in_channels": shapes["input_blocks.0.0.weight"][1],
+        "out_channels": shapes["out.2.weight"][0],
+        "block_out_channels": channels,
+        "layers_per_block": len(levels[0]),
+        "cross_attention_dim": shapes[middle][1],
+        "use_linear_projection": linear,
+        "attention_head_dim": [max(1, c // _HEAD_WIDTH_SD2) for c in channels] if linear else _HEADS_SD1,
+        "down_block_types": ["CrossAttnDownBlock2D" if a else "DownBlock2D" for a in attends],
+        "up_block_types": ["CrossAttnUpBlock2D" if a else "UpBlock2D" for a in reversed(attends)],
+    }
+
+
+def vae_config(shapes: Shapes) -> dict[str, Any]:
+    """Config of an AutoencoderKL."""
+    levels = 1 + _highest(shapes, r"encoder\.down\.(\d+)\.")
+    return {
+        "_class_name": "AutoencoderKL",
+        "block_out_channels": [shapes[f"encoder.down.{i}.block.0.conv1.weight"][0] for i in range(levels)],
+        "layers_per_block": 1 + _highest(shapes, r"encoder\.down\.0\.block\.(\d+)\."),
+        "latent_channels": shapes["quant_conv.weight"][0] // 2,
+        "down_block_types": ["DownEncoderBlock2D"] * levels,
+        "up_block_types": ["UpDecoderBlock2D"] * levels,
+        "scaling_factor": 0.18215,
+    }
+
+
+def text_config(shapes: Shapes, *, open_clip: bool) -> dict[str, Any]:
+    """Config of a CLIPTextModel under transformers' names."""
+    vocabulary, width = shapes["embeddings.token_embedding.weight"]
+    return {
+        "vocab_size": vocabulary,
+        "hidden_size": width,
+        "intermediate_size": shapes["encoder.layers.0.mlp.fc1.weight"][0],
+        "num_hidden_layers": 1 + _highest(shapes, r"encoder\.layers\.(\d+)\."),
+        "num_attention_heads": max(1, width // _CLIP_HEAD_WIDTH),
+        "max_position_embeddings": shapes["embeddings.position_embedding.weight"][0],
+        "hidden_act": "gelu" if open_clip else "quick_gelu",
+    }
+
+
+def _unwrapped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix("text_model."): tensor for name, tensor in state.items()}
+
+
+def open_clip_as_clip(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """OpenCLIP's text encoder under transformers' names, without its last layer, which SD 2.x skips."""
+    last = _highest(state, r"transformer\.resblocks\.(\d+)\.")
+    named = {
+        "embeddings.token_embedding.weight": state["token_embedding.weight"],
+        "embeddings.position_embedding.weight": state["positional_embedding"],
+        "final_layer_norm.weight": state["ln_final.weight"],
+        "final_layer_norm.bias": state["ln_final.bias"],
+    }
+    for name, tensor in state.items():
+        if (found := re.match(r"transformer\.resblocks\.(\d+)\.(.+)\.?(weight|bias)$", name)) and int(found[1]) < last:
+            named |= _layer_names(f"encoder.layers.{found[1]}", found[2].rstrip("._"), found[3], tensor)
+    return named
+
+
+def _layer_names(layer: str, part: str, kind: str, tensor: Tensor) -> dict[str, Tensor]:
+    if part == "attn.in_proj":
+        return {f"{layer}.self_attn.{x}_proj.{kind}": t for x, t in zip("qkv", tensor.chunk(3), strict=True)}
+    return {f"{layer}.{_OPEN_CLIP_NAMES[part]}.{kind}": tensor}
+
+
+def _highest(names: Mapping[str, Any], pattern: str) -> int:
+    """The highest number a pattern finds in the names. Raises KeyError(pattern) when it finds none."""
+    found = [int(match[1]) for name in names if (match := re.match(pattern, name))]
+    if not found:
+        raise KeyError(pattern)
+    return max(found)

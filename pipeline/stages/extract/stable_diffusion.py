@@ -1,0 +1,65 @@
+"""crops -> feature maps of Stable Diffusion's decoder (Rombach et al., CVPR 2022)."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, ClassVar
+
+import torch
+
+from pipeline.digests import files_digest
+from pipeline.spec import spec
+from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.stages.extract.weights import Weights, find
+
+
+@spec
+class StableDiffusion(DiffusionFeatures):
+    """Stable Diffusion 1.x or 2.x; the paper reads layers 2, 5, 8 and 11 at timestep 50.
+
+    ``weights``: a hub id (``revision`` is for it alone), a diffusers folder, or one .safetensors file of the original
+    layout. Both fields say where; the digest of the files found there stands for them in the recipe.
+    """
+
+    kind: ClassVar[str] = "extract.stable_diffusion"
+    version: ClassVar[int] = 1
+
+    weights: str = "stable-diffusion-v1-5/stable-diffusion-v1-5"
+    revision: str | None = None
+    prompt: str = ""
+
+    @cached_property
+    def source(self) -> Weights:
+        """The weights, found (and fetched, for a hub id). Raises BadInput."""
+        return find(self.weights, self.revision)
+
+    @cached_property
+    def weights_digest(self) -> str:
+        """sha256 of all files the features depend on. Raises BadInput."""
+        self.architecture()  # first: a folder of another class is refused for what it is
+        return files_digest(self.source.files)
+
+    @property
+    def model(self) -> str:
+        """``stable_diffusion-`` and the first 8 digits of the weights' digest."""
+        return f"stable_diffusion-{self.weights_digest[:8]}"
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe; the weights by digest, wherever they lie."""
+        recipe = super().recipe() | {"weights": self.weights_digest}
+        del recipe["revision"]
+        return recipe
+
+    def architecture(self) -> Architecture:
+        """Configs of the weights' U-Net, VAE and scheduler."""
+        return self._architecture
+
+    @cached_property
+    def _architecture(self) -> Architecture:
+        return self.source.architecture()
+
+    def load_model(self) -> LoadedModel:
+        """Text encoder first and freed before the U-Net comes: the peak is the U-Net alone."""
+        dtype = getattr(torch, self.dtype)
+        prompt = self.source.prompt(self.prompt).to(dtype)
+        return LoadedModel(self.source.unet(dtype), self.source.vae(dtype), prompt)

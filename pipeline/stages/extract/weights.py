@@ -1,0 +1,414 @@
+"""Weights of Stable Diffusion: found, checked, digested, loaded. safetensors only; nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from pipeline.errors import BadInput
+from pipeline.stages.extract.diffusion import Architecture
+
+FIELD = "extract.weights"
+_PICKLES = (".bin", ".ckpt", ".pt", ".pth")
+_SCHEDULE = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
+_SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
+_TOKENIZER_FILES = ("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
+_STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
+_PORTION = 1 << 26  # values read before a file is mapped anew
+_BOS, _EOS = 49406, 49407  # of CLIP's vocabulary (Radford et al., ICML 2021)
+
+
+class Weights(Protocol):
+    """A place that holds a Stable Diffusion model. ``files``: all that is read from it, by name."""
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The files whose bytes decide the features."""
+        ...
+
+    def architecture(self) -> Architecture:
+        """Configs, checked to be Stable Diffusion 1.x or 2.x. Raises BadInput."""
+        ...
+
+    def unet(self, dtype: torch.dtype) -> nn.Module:
+        """The U-Net. Raises BadInput for weights that do not fit the config."""
+        ...
+
+    def vae(self, dtype: torch.dtype) -> nn.Module:
+        """The VAE, its decoder dropped. Raises BadInput as ``unet`` does."""
+        ...
+
+    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+        """The text encoder's last hidden state, float32; the encoder is freed. Raises BadInput as ``unet`` does."""
+        ...
+
+
+def is_local(weights: str) -> bool:
+    """True for what looks like a path: it exists, begins as a path does, or ends like a file of weights."""
+    return (
+        weights.startswith(("/", "./", "../", "~"))
+        or weights.endswith((".safetensors", *_PICKLES))
+        or Path(weights).exists()
+    )
+
+
+def find(weights: str, revision: str | None) -> Weights:
+    """What lies at a hub id, in a diffusers folder, or in one .safetensors file of the original layout."""
+    from pipeline.stages.extract.single_file import SingleFile
+
+    if not is_local(weights):
+        return DiffusersFolder(_download(weights, revision))
+    path = Path(weights).expanduser()
+    if not path.exists():
+        raise BadInput(
+            FIELD, found=f"{weights!r}, which does not exist", needed="a diffusers folder or a .safetensors file"
+        )
+    if path.is_dir():
+        return DiffusersFolder(path)
+    if path.suffix != ".safetensors":
+        raise BadInput(FIELD, found=f"{weights!r}", needed="safetensors: convert it, pickled weights are never opened")
+    return SingleFile(path)
+
+
+@dataclass(frozen=True)
+class DiffusersFolder:
+    """A folder as diffusers' save_pretrained writes it: unet, vae, text_encoder; tokenizer and scheduler if present."""
+
+    root: Path
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Configs and weights in use; a file nobody reads does not count."""
+        paths = [self._json(part) for part in _STEMS]
+        paths += [path for part in _STEMS for path in self._tensors(part)]
+        paths += [self.root / "scheduler" / "scheduler_config.json"]
+        paths += [self.root / "tokenizer" / name for name in _TOKENIZER_FILES]
+        return {path.relative_to(self.root).as_posix(): path for path in paths if path.exists()}
+
+    def architecture(self) -> Architecture:
+        """See Weights."""
+        if (self.root / "text_encoder_2").exists():
+            raise BadInput(
+                self.root / "text_encoder_2", found="a second text encoder", needed="Stable Diffusion 1.x or 2.x"
+            )
+        unet, vae = self._config("unet"), self._config("vae")
+        check_unet(unet, self._json("unet"))
+        check_class(vae, "AutoencoderKL", self._json("vae"))
+        check_latents(unet, vae, self._json("unet"))
+        scheduler = self.root / "scheduler" / "scheduler_config.json"
+        return Architecture(unet, vae, alphas_cumprod(read_json(scheduler) if scheduler.exists() else {}, scheduler))
+
+    def unet(self, dtype: torch.dtype) -> nn.Module:
+        """See Weights."""
+        from diffusers import UNet2DConditionModel
+
+        return self._filled(self._empty(UNet2DConditionModel, "unet", dtype), "unet")
+
+    def vae(self, dtype: torch.dtype) -> nn.Module:
+        """See Weights."""
+        from diffusers import AutoencoderKL
+
+        return self._filled(without_decoder(self._empty(AutoencoderKL, "vae", dtype)), "vae")
+
+    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+        """See Weights."""
+        config, width = self._config("text_encoder"), self._config("unet")["cross_attention_dim"]
+        if config.get("hidden_size") != width:
+            found = f"hidden_size {config.get('hidden_size')}"
+            raise BadInput(self._json("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
+        ids = self._token_ids(text, config)
+        outer, inner = empty_text_encoder(config, self._json("text_encoder"))
+        self._filled(inner, "text_encoder")
+        return last_hidden_state(outer, ids)
+
+    def _token_ids(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
+        folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
+        if not any((folder / name).exists() for name in ("vocab.json", "tokenizer.json")):
+            return empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
+        from transformers import CLIPTokenizer
+
+        try:
+            tokenizer = CLIPTokenizer.from_pretrained(str(folder), local_files_only=True)
+            ids = tokenizer(text, padding="max_length", max_length=length, truncation=False)["input_ids"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise BadInput(folder, found=one_line(error), needed="the files of a CLIP tokenizer") from None
+        if len(ids) > length:
+            raise BadInput(
+                "extract.prompt", found=f"{len(ids)} tokens", needed=f"at most {length}, begin and end included"
+            )
+        return torch.tensor([ids])
+
+    def _json(self, part: str) -> Path:
+        return self.root / part / "config.json"
+
+    def _config(self, part: str) -> dict[str, Any]:
+        path = self._json(part)
+        if not path.exists():
+            seen = sorted(p.parent.name for p in self.root.glob("*/config.json"))
+            needed = "a Stable Diffusion 1.x or 2.x folder with unet, vae and text_encoder"
+            raise BadInput(path, found=f"no such file (configs of: {', '.join(seen) or 'nothing'})", needed=needed)
+        return read_json(path)
+
+    def _tensors(self, part: str) -> list[Path]:
+        """Files of a part's weights, full precision where there is a choice: one, or an index and its shards."""
+        folder, stem = self.root / part, _STEMS[part]
+        for variant in ("", ".fp16"):
+            index = folder / f"{stem}.safetensors.index{variant}.json"
+            if (single := folder / f"{stem}{variant}.safetensors").exists():
+                return [single]
+            if index.exists():
+                return [
+                    index,
+                    *sorted({folder / str(name) for name in read_json(index).get("weight_map", {}).values()}),
+                ]
+        pickled = sorted(p.name for p in folder.glob("*") if p.suffix in _PICKLES)
+        found = f"only {', '.join(pickled)}" if pickled else "no such file"
+        needed = "safetensors: convert it (save_pretrained, safe_serialization=True)" if pickled else "the weights"
+        raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
+
+    def _empty(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
+        return empty_model(cls, self._config(part), dtype, self._json(part))
+
+    def _filled(self, model: nn.Module, part: str) -> nn.Module:
+        fill(model, [path for path in self._tensors(part) if path.suffix == ".safetensors"])
+        return model
+
+
+def check_unet(config: Mapping[str, Any], where: Path) -> None:
+    """Raises BadInput, naming the field, for a U-Net that is not that of Stable Diffusion 1.x or 2.x."""
+    check_class(config, "UNet2DConditionModel", where)
+    for name in ("addition_embed_type", "class_embed_type", "encoder_hid_dim_type"):
+        if config.get(name) is not None:
+            raise BadInput(
+                where, found=f"{name} {config[name]!r}", needed="none, as Stable Diffusion 1.x and 2.x have it"
+            )
+    for name in ("block_out_channels", "layers_per_block", "cross_attention_dim"):
+        if not config.get(name):
+            raise BadInput(where, found=f"no {name}", needed="the config of a UNet2DConditionModel")
+    for name in ("layers_per_block", "cross_attention_dim"):
+        if not isinstance(config[name], int):
+            raise BadInput(where, found=f"{name} {config[name]!r}", needed="one whole number")
+    if strange := sorted(set(config.get("up_block_types", ())) - {"UpBlock2D", "CrossAttnUpBlock2D"}):
+        raise BadInput(where, found=f"up_block_types {strange[0]!r}", needed="UpBlock2D or CrossAttnUpBlock2D")
+
+
+def check_class(config: Mapping[str, Any], name: str, where: Path) -> None:
+    """Raises BadInput when a config belongs to another class."""
+    if config.get("_class_name") != name:
+        raise BadInput(where, found=f"_class_name {config.get('_class_name')!r}", needed=name)
+
+
+def check_latents(unet: Mapping[str, Any], vae: Mapping[str, Any], where: Path) -> None:
+    """Raises BadInput for a U-Net that takes more than a latent: inpainting, depth, editing, upscaling."""
+    needed = int(vae.get("latent_channels", 4))
+    if unet.get("in_channels", 4) != needed:
+        found = f"in_channels {unet['in_channels']}"
+        raise BadInput(where, found=found, needed=f"{needed}, the latent alone (no inpainting or depth model)")
+
+
+def alphas_cumprod(scheduler: Mapping[str, Any], where: Path | None = None) -> Float[np.ndarray, " timesteps"]:
+    """abar_t of a scheduler's config; Stable Diffusion's scaled-linear betas for what it leaves open."""
+    from diffusers import DDPMScheduler
+
+    if "Flow" in str(scheduler.get("_class_name", "")):
+        raise BadInput(where, found=f"_class_name {scheduler['_class_name']!r}", needed="a scheduler with betas")
+    schedule = _SCHEDULE | {name: scheduler[name] for name in _SCHEDULE_FIELDS if scheduler.get(name) is not None}
+    try:
+        ddpm: Any = DDPMScheduler(**schedule)
+        return ddpm.alphas_cumprod.double().numpy()
+    except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
+        raise BadInput(where, found=one_line(error), needed="a schedule of betas that diffusers knows") from None
+
+
+def empty_prompt(text: str, where: Path, *, open_clip: bool, length: int) -> Int[Tensor, "1 l"]:
+    """Token ids of "" without a tokenizer: begin, end, padding. Raises BadInput for any other text.
+
+    Stable Diffusion 1.x pads CLIP's text with the end token, 2.x pads OpenCLIP's with 0.
+    """
+    if text:
+        raise BadInput(
+            "extract.prompt", found=f"{text!r} and no tokenizer at {where}", needed='"", or a diffusers folder with one'
+        )
+    padding = 0 if open_clip else _EOS
+    return torch.tensor([[_BOS, _EOS] + [padding] * (length - 2)])
+
+
+def empty_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
+    """A model of a diffusers class, its memory set aside and not yet written to. Raises BadInput."""
+    try:
+        with torch.device("meta"), quiet_libraries():
+            model = cls.from_config(dict(config)).to(dtype)
+    except (ValueError, TypeError, KeyError, IndexError, RuntimeError, NotImplementedError) as error:
+        raise BadInput(where, found=one_line(error), needed=f"a config of {cls.__name__}") from None
+    return model.to_empty(device="cpu")
+
+
+def empty_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Module, nn.Module]:
+    """A CLIPTextModel, and the part of it that holds the weights: itself, within a wrapper until transformers 5.6."""
+    from transformers import CLIPTextConfig, CLIPTextModel
+
+    try:
+        with quiet_libraries():
+            model: Any = CLIPTextModel(CLIPTextConfig.from_dict(dict(config)))
+    except (ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
+        raise BadInput(where, found=one_line(error), needed="a config of CLIPTextModel") from None
+    return model, getattr(model, "text_model", model)
+
+
+def fill(model: nn.Module, paths: Sequence[Path]) -> None:
+    """Weights from safetensors files into a model's own memory. Raises BadInput for ones that do not fit.
+
+    A file stays mapped for some hundred megabytes only: what has been read of it would count as a second copy.
+    """
+    from safetensors import safe_open
+
+    missing = dict(model.named_parameters())
+    for path in paths:
+        fitting = {name: current_name(name) for name in tensor_shapes(path)}
+        fitting = {stored: name for stored, name in fitting.items() if name in missing}
+        for stored_names in _portions(fitting, missing):
+            with safe_open(str(path), framework="pt") as tensors, torch.no_grad():
+                for stored in stored_names:
+                    copy_weight(tensors.get_tensor(stored), missing.pop(fitting[stored]), f"{path}, tensor {stored}")
+    check_missing(sorted(missing), paths[0])
+
+
+def current_name(name: str) -> str:
+    """A weight's name today: no wrapper around the text encoder; the VAE's attention as since diffusers 0.17."""
+    name = name.removeprefix("text_model.")
+    renamed = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
+    if not renamed:
+        return name
+    return (
+        renamed[1] + {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}[renamed[2]] + renamed[3]
+    )
+
+
+def check_missing(names: Sequence[str], where: Path) -> None:
+    """Raises BadInput when weights are missing: diffusers and transformers would draw them at random."""
+    if names:
+        raise BadInput(where, found=f"no tensor for {names[0]} ({len(names)} missing)", needed="all weights")
+
+
+def _portions(names: Mapping[str, str], parameters: Mapping[str, nn.Parameter]) -> Iterator[list[str]]:
+    portion: list[str] = []
+    size = 0
+    for stored, name in names.items():
+        portion.append(stored)
+        size += parameters[name].numel()
+        if size > _PORTION:
+            yield portion
+            portion, size = [], 0
+    yield portion
+
+
+def copy_weight(value: Tensor, parameter: nn.Parameter, where: str) -> None:
+    """A stored weight into a model's memory. Raises BadInput for another shape."""
+    if value.numel() == parameter.numel() and value.ndim > parameter.ndim:
+        value = value.view(parameter.shape)  # 1x1 kernels that became matrices
+    if value.shape != parameter.shape:
+        raise BadInput(
+            where, found=f"shape {tuple(value.shape)}", needed=f"{tuple(parameter.shape)}, as the config says"
+        )
+    parameter.copy_(value)
+
+
+def last_hidden_state(text_encoder: nn.Module, ids: Int[Tensor, "1 l"]) -> Float[Tensor, "1 l d"]:
+    """The text encoder's answer after its final layer norm, float32."""
+    with torch.no_grad():
+        return text_encoder.float().eval()(ids)[0].clone()
+
+
+def without_decoder(vae: Any) -> nn.Module:
+    """The VAE with its encoder alone."""
+    vae.decoder, vae.post_quant_conv = None, None
+    return vae
+
+
+def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Names and shapes from a safetensors header. Raises BadInput for a file that is broken or cut off."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(str(path), framework="pt") as tensors:
+            return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise BadInput(path, found=one_line(error), needed="a complete safetensors file") from None
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Without the progress bars and remarks of diffusers and transformers while they read weights."""
+    from diffusers.utils import logging as diffusers_logging
+    from transformers.utils import logging as transformers_logging
+
+    libraries = (diffusers_logging, transformers_logging)
+    before = [library.get_verbosity() for library in libraries]
+    for library in libraries:
+        library.set_verbosity_error()
+        library.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for library, verbosity in zip(libraries, before, strict=True):
+            library.set_verbosity(verbosity)
+            library.enable_progress_bar()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object. Raises BadInput."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise BadInput(path, found=one_line(error), needed="valid JSON") from None
+    if not isinstance(value, dict):
+        raise BadInput(path, found=type(value).__name__, needed="a JSON object")
+    return value
+
+
+def one_line(error: Exception) -> str:
+    """The first line of an error's text, for a BadInput."""
+    text = str(error).strip() or type(error).__name__
+    return text.splitlines()[0][:200]
+
+
+def _download(hub_id: str, revision: str | None) -> Path:
+    """Folder of the hub's files that are needed; the half-precision ones only where there are no others."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+    try:
+        for variant in ("", ".fp16"):
+            folder = Path(snapshot_download(hub_id, revision=revision, allow_patterns=_patterns(variant)))
+            if any((folder / "unet").glob("*.safetensors")):
+                break
+    except (HfHubHTTPError, HFValidationError, OSError) as error:
+        found = f"{hub_id!r}, which is no local path and was not fetched: {one_line(error)}"
+        needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder"
+        raise BadInput(FIELD, found=found, needed=needed) from None
+    return folder
+
+
+def _patterns(variant: str) -> list[str]:
+    tensors = [
+        f"{part}/{stem}{end}"
+        for part, stem in _STEMS.items()
+        for end in (
+            f"{variant}.safetensors",
+            f".safetensors.index{variant}.json",
+            f"{variant}-[0-9]*-of-[0-9]*.safetensors",
+            f"-[0-9]*-of-[0-9]*{variant}.safetensors",
+        )
+    ]
+    configs = [f"{part}/config.json" for part in _STEMS] + ["scheduler/scheduler_config.json"]
+    return [*configs, *(f"tokenizer/{name}" for name in _TOKENIZER_FILES), *tensors]
