@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -37,7 +39,7 @@ def main() -> None:
         else:
             _hydra_main()
     except (DzopError, HydraException, OmegaConfBaseException) as error:
-        sys.exit(f"error: {_one_line(error)}")
+        sys.exit(_told(error))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of a pipe has left: not a fault
         sys.exit(1)
@@ -47,6 +49,15 @@ def main() -> None:
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
 def _hydra_main(config: DictConfig) -> None:
+    try:
+        _job(config)
+    except DzopError as error:
+        if HydraConfig.get().mode is RunMode.RUN:
+            sys.exit(_told(error))
+        raise  # Hydra names the overrides of the sweep's failed job, after the others have run
+
+
+def _job(config: DictConfig) -> None:
     # one plain dict, so that nothing below knows OmegaConf
     values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(values, dict)
@@ -95,8 +106,9 @@ def variant(values: Mapping[str, Any], where: str) -> Any:
     return chosen.resolve() if hasattr(chosen, "resolve") else chosen
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+def _told(error: BaseException) -> str:
+    """One line; Hydra's list of the places it searched adds nothing."""
+    return "error: " + " ".join(str(error).split("\nConfig search path")[0].split())
 
 
 if __name__ == "__main__":

@@ -5,25 +5,28 @@ from __future__ import annotations
 import argparse
 import json
 from collections import defaultdict
+from pathlib import Path
 
 from pipeline.errors import DzopError
 from pipeline.store import LocalStoreConfig, S3StoreConfig, Store
 from pipeline.store.admin import Row, collect, entries, find, verify
+from pipeline.tally import human
 
 
 def cache_command(arguments: list[str]) -> None:
     """Parse and run one ``dzop cache`` command; output on stdout."""
+    place = argparse.ArgumentParser(add_help=False)
+    place.add_argument("--root", default="cache", help="the store: a folder or s3://bucket/prefix (default: cache)")
     parser = argparse.ArgumentParser(prog="dzop cache", description="Look after the feature store.")
-    parser.add_argument("--root", default="cache", help="the store: a folder or s3://bucket/prefix (default: cache)")
     commands = parser.add_subparsers(dest="command", required=True)
-    ls = commands.add_parser("ls", help="every entry: state, rows, size, age, what it is")
+    ls = commands.add_parser("ls", parents=[place], help="every entry: state, rows, size, age, what it is")
     ls.add_argument("--long", action="store_true", help="also what each entry was made from")
-    commands.add_parser("du", help="bytes by folder")
-    commands.add_parser("verify", help="read every byte and check it; damaged entries are marked incomplete")
-    gc = commands.add_parser("gc", help="remove incomplete entries, and old ones if asked")
+    commands.add_parser("du", parents=[place], help="bytes by folder")
+    commands.add_parser("verify", parents=[place], help="read every byte and check it; damaged entries are marked incomplete")
+    gc = commands.add_parser("gc", parents=[place], help="remove incomplete entries, and old ones if asked")
     gc.add_argument("--older-than", type=float, metavar="DAYS", help="also complete entries older than this")
     gc.add_argument("--dry-run", action="store_true", help="only say what would go")
-    path = commands.add_parser("path", help="where an entry lies and what it was made from")
+    path = commands.add_parser("path", parents=[place], help="where an entry lies and what it was made from")
     path.add_argument("key", help="the first digits of its key")
     asked = parser.parse_args(arguments)
     store = _open(asked.root)
@@ -44,8 +47,6 @@ def cache_command(arguments: list[str]) -> None:
 def _open(root: str) -> Store:
     if root.startswith("s3://"):
         return Store(S3StoreConfig(url=root), announce=print)
-    from pathlib import Path
-
     if not Path(root).is_dir():
         raise DzopError(f"{root}: found no such folder, needs a store (--root)")
     return Store(LocalStoreConfig(root=root), announce=print)
@@ -87,12 +88,3 @@ def _gc(store: Store, older_than_days: float | None, *, dry_run: bool) -> None:
     for row in doomed:
         print(f"{'would remove' if dry_run else 'removed'} {row.path} ({human(row.stored_bytes)}, {row.state})")
     print(f"{len(doomed)} entries, {human(sum(row.stored_bytes for row in doomed))}")
-
-
-def human(size: float) -> str:
-    """Bytes in a unit a person reads."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if size < 1000:
-            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
-        size /= 1000
-    return f"{size:.1f} TB"

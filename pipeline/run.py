@@ -16,7 +16,6 @@ import torch
 
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.results import results_name, rows_of, write_results
-from pipeline.cache_cli import human
 from pipeline.digests import remember_in
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, Node
@@ -29,7 +28,7 @@ from pipeline.report.summary import answers_table, failures_table, objects_table
 from pipeline.route import Stages
 from pipeline.spec import NonNegative, Runtime, spec
 from pipeline.store import Store
-from pipeline.tally import Tally
+from pipeline.tally import Tally, human
 
 KEY_DIGITS = 12
 ROWS_SHOWN = 48  # a longer table goes to poses.json alone; the terminal shows one line per object
@@ -126,7 +125,7 @@ def _headline(options: Options, stages: Stages, data: Dataset, targets: Sequence
         f"{options.name} on {data.name} {data.split}: {len(targets)} targets, {images} images, {objects} objects",
         f"renderer {stages.render.kind.split('.')[-1]}, features {stages.extract.model}, store {store.place}",
     ]
-    return "\n".join([*lines, stages.extract.notice] if stages.extract.notice else lines)
+    return "\n".join([*lines, *filter(None, [stages.extract.notice])])
 
 
 def plan_table(nodes: Sequence[Node]) -> str:

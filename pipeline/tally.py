@@ -64,3 +64,12 @@ class Tally:
     def as_record(self) -> dict[str, dict[str, float]]:
         """JSON-able counts."""
         return {step: {**vars(count), "time_s": round(count.time_s, 3)} for step, count in self.counts.items()}
+
+
+def human(size: float) -> str:
+    """Bytes in a unit a person reads."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} TB"

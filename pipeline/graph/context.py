@@ -63,7 +63,7 @@ class Context:
 
     def K(self, image: ImageId) -> Float[np.ndarray, "3 3"]:
         """Camera matrix of an image."""
-        return self.dataset.scene(image[0]).camera(image[1]).K
+        return self.dataset.K(*image)
 
     def tensor(self, values: np.ndarray) -> torch.Tensor:
         """Stored values on the device."""

@@ -44,7 +44,8 @@ class QueryNodes:
             for path in self.run.stages.detect.sources(self.run.dataset, self.run.targets)
         }
         recipe = {"kind": "detections", "detect": self.run.stages.detect.recipe()}
-        asked = digest([[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.run.targets])
+        targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.run.targets]
+        asked = digest([targets, self.run.dataset.given_bbox_xyxy])
         return make_ref("detections", recipe, {"sources": files_digest(sources), "targets": asked})
 
     @cached_property

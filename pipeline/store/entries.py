@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -75,9 +75,6 @@ class Store:
     def place(self) -> str:
         """Where it is, for people."""
         return self.backend.place
-
-    def _announce_for(self, ref: Ref, text: str) -> None:
-        self.announce(f"{ref.path}: {text}")
 
     # --- state -----------------------------------------------------------------------------------------------------
 

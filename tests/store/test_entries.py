@@ -31,7 +31,7 @@ def compute(rows: list[int], log: list[list[int]] | None = None) -> dict:
 
 
 def fill(store: Store, log: list[list[int]] | None = None, refs=(REF,)):
-    return store.fill({ref: LAYOUT for ref in refs}, rows=ROWS, batch=4, compute=lambda rows: compute(rows, log))
+    return store.fill(dict.fromkeys(refs, LAYOUT), rows=ROWS, batch=4, compute=lambda rows: compute(rows, log))
 
 
 @pytest.fixture(params=["local", "memory"])

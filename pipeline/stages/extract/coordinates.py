@@ -29,6 +29,7 @@ class Coordinates(Spec):
     kind: ClassVar[str] = "extract.coordinates"
     version: ClassVar[int] = 1
     needs_geometry: ClassVar[bool] = True
+    notice: ClassVar[str] = "oracle: features are the true object coordinates; the figures show geometry errors alone"
     model: ClassVar[str] = "coordinates"
     timestep: ClassVar[int] = 0
 

@@ -66,6 +66,7 @@ class DiffusionFeatures(Spec):
     """
 
     needs_geometry: ClassVar[bool] = False
+    notice: ClassVar[str] = ""
 
     hook: Hook = "pre"
     input_size: Positive = 512

@@ -30,6 +30,7 @@ class Hog(Spec):
     kind: ClassVar[str] = "extract.hog"
     version: ClassVar[int] = 1
     needs_geometry: ClassVar[bool] = False
+    notice: ClassVar[str] = ""
     model: ClassVar[str] = "hog"
     timestep: ClassVar[int] = 0
 

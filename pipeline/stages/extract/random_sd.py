@@ -34,6 +34,10 @@ class RandomSD(DiffusionFeatures):
 
     kind: ClassVar[str] = "extract.random_sd"
     version: ClassVar[int] = 1
+    notice: ClassVar[str] = (
+        "note: a small U-Net with random weights stands in for Stable Diffusion; its poses show that the route works, "
+        "not what diffusion features can do"
+    )
 
     input_size: Positive = 128
     channels: tuple[Width, Width, Width, Width] = (32, 64, 128, 128)

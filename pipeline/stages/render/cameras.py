@@ -22,7 +22,7 @@ class Studio(Spec):
     count: Positive = 300
     inplane: Positive = 1
     size: Annotated[int, Field(ge=8, le=4096)] = 256
-    supersample: Annotated[int, Field(ge=1, le=8)] = 2
+    supersample: Annotated[int, Field(ge=1, le=8)] = 1
     distance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 6.0
     fill: Annotated[float, Field(gt=0, le=1)] = 0.9
     ambient: Fraction = 0.45

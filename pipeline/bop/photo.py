@@ -1,0 +1,125 @@
+"""One's own mesh, photograph, camera and mask or box -> a dataset of one target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.bop.dataset import Dataset
+from pipeline.bop.images import image_size, read_rgb
+from pipeline.bop.scene import Box, check_K, edges
+from pipeline.errors import BadInput
+from pipeline.items.objects import ObjectModel
+from pipeline.items.views import Image, Target
+from pipeline.meshes import diameter_mm, read_mesh
+from pipeline.spec import PositiveFloat, Spec, digest, spec
+
+SCENE_ID, IM_ID, OBJ_ID = 0, 0, 1
+_SMALLEST_MM = 2.0
+
+
+@spec
+class PhotoConfig(Spec):
+    """A mesh, a photograph, K, and where the object is: a mask, or a box.
+
+    ``K``: fx, fy, cx, cy or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height of its pixels.
+    ``scale`` multiplies the mesh's vertices, 1000 for a mesh in metres.
+    """
+
+    kind: ClassVar[str] = "dataset.photo"
+
+    mesh: str
+    image: str
+    K: tuple[float, ...]
+    mask: str | None = None
+    bbox: tuple[float, float, float, float] | None = None
+    scale: PositiveFloat = 1.0
+    name: str = "photo"
+
+    def open(self) -> Photo:
+        """The dataset, checked. Raises BadInput."""
+        image = Path(self.image).expanduser()
+        size_hw = image_size(image)
+        K = self._matrix()
+        check_K(K, size_hw, "dataset.K")
+        if (self.mask is None) == (self.bbox is None):
+            found = "neither" if self.mask is None else "both"
+            raise BadInput(
+                "dataset", found=f"{found} of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
+            )
+        return Photo(
+            name=self.name,
+            root=image.parent,
+            split="test",
+            models="",
+            models_info={},
+            targets=(Target(SCENE_ID, IM_ID, OBJ_ID),),
+            photo_path=image,
+            mesh_path=Path(self.mesh).expanduser(),
+            camera_matrix=K,
+            mask_file=None if self.mask is None else Path(self.mask).expanduser(),
+            bbox_xyxy=None if self.bbox is None else edges(self.bbox),
+            scale=self.scale,
+        )
+
+    def _matrix(self) -> Float[np.ndarray, "3 3"]:
+        if len(self.K) == 4:
+            fx, fy, cx, cy = self.K
+            return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        if len(self.K) == 9:
+            return np.array(self.K, float).reshape(3, 3)
+        raise BadInput(
+            "dataset.K", found=f"{len(self.K)} numbers", needed="[fx,fy,cx,cy] or the 9 of the matrix, row by row"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Photo(Dataset):
+    """A dataset of one image and one object, without ground truth."""
+
+    photo_path: Path = Path()
+    mesh_path: Path = Path()
+    camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    mask_file: Path | None = None
+    bbox_xyxy: Box | None = None
+    scale: float = 1.0
+
+    @property
+    def given_bbox_xyxy(self) -> Box | None:
+        """The box, when there is one instead of a mask."""
+        return self.bbox_xyxy
+
+    def image(self, scene_id: int, im_id: int) -> Image:
+        """The photograph."""
+        return Image(scene_id, im_id, read_rgb(self.photo_path), self.camera_matrix)
+
+    def image_path(self, scene_id: int, im_id: int) -> Path:
+        """Its file."""
+        return self.photo_path
+
+    def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
+        """Its camera matrix."""
+        return self.camera_matrix
+
+    def has_ground_truth(self, scene_id: int) -> bool:
+        """No."""
+        return False
+
+    def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
+        """The mesh, scaled. Raises BadInput for one too small to be in millimetres."""
+        mesh = read_mesh(self.mesh_path)
+        if self.scale != 1.0:
+            scaled: dict[str, Any] = {
+                "digest": digest([mesh.digest, self.scale]),
+                "vertices": mesh.vertices * self.scale,
+            }
+            mesh = replace(mesh, **scaled)
+        diameter = diameter_mm(mesh)
+        if diameter < _SMALLEST_MM:
+            found = f"a mesh of diameter {diameter:.3g} (it looks like metres)"
+            raise BadInput(self.mesh_path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
+        return ObjectModel(obj_id, mesh, diameter)

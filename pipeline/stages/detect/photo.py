@@ -1,0 +1,59 @@
+"""one's own mask or box -> the one detection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from pipeline.bop.dataset import Dataset
+from pipeline.bop.images import read_mask
+from pipeline.bop.masks import encode
+from pipeline.bop.photo import Photo
+from pipeline.errors import BadInput
+from pipeline.functional.camera import mask_bbox
+from pipeline.items.views import Detection, Target
+from pipeline.spec import Spec, spec
+
+
+@spec
+class PhotoMask(Spec):
+    """The mask or box that ``dataset=photo`` was given, with score 1."""
+
+    kind: ClassVar[str] = "detect.photo"
+    version: ClassVar[int] = 1
+
+    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+        """The photograph, and the mask if there is one."""
+        photo = _photo(dataset)
+        return [photo.photo_path] + ([] if photo.mask_file is None else [photo.mask_file])
+
+    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+        """One detection. Raises BadInput for a mask of another size than the photograph, or an empty one."""
+        photo = _photo(dataset)
+        return [_detection(photo, target) for target in targets]
+
+
+def _photo(dataset: Dataset) -> Photo:
+    if not isinstance(dataset, Photo):
+        raise BadInput("detect", found="photo for a dataset that is none", needed="dataset=photo, or another detect")
+    return dataset
+
+
+def _detection(photo: Photo, target: Target) -> Detection:
+    ids = target.scene_id, target.im_id, target.obj_id
+    h, w = photo.image_size(target.scene_id, target.im_id)
+    if photo.mask_file is None:
+        x0, y0, x1, y1 = photo.bbox_xyxy or (0.0,) * 4
+        if x1 <= x0 or y1 <= y0 or x1 <= -0.5 or y1 <= -0.5 or x0 >= w - 0.5 or y0 >= h - 0.5:
+            needed = f"x, y, width, height of a box inside the image of {w} x {h}"
+            raise BadInput("dataset.bbox", found=[x0 + 0.5, y0 + 0.5, x1 - x0, y1 - y0], needed=needed)
+        return Detection(*ids, 1.0, 0.0, (x0, y0, x1, y1))
+    mask = read_mask(photo.mask_file)
+    if mask.shape != (h, w):
+        found = f"{mask.shape[1]} x {mask.shape[0]} pixels"
+        raise BadInput(photo.mask_file, found=found, needed=f"those of the photograph, {w} x {h} (width x height)")
+    box = mask_bbox(mask)
+    if box is None:
+        raise BadInput(photo.mask_file, found="an empty mask", needed="the object's pixels not black")
+    return Detection(*ids, 1.0, 0.0, box, encode(mask))

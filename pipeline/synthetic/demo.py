@@ -1,0 +1,45 @@
+"""The demo's dataset: written when it is first asked for, then opened like any other."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pipeline.bop.dataset import Dataset, open_dataset
+from pipeline.errors import BadInput
+from pipeline.spec import Fraction, NonNegative, Positive, Spec, digest, spec
+from pipeline.synthetic.scenes import write_dataset
+
+
+@spec
+class DemoConfig(Spec):
+    """Procedural objects in cluttered, partly occluded scenes with exact ground truth.
+
+    ``root`` holds one folder for every choice of the other fields. ``per_image``: objects in one image; ``occluded``:
+    the share of them that a distractor hides in part.
+    """
+
+    kind: ClassVar[str] = "dataset.demo"
+
+    root: str = "data/demo"
+    name: str = "demo"
+    objects: Positive = 3
+    images: Positive = 6
+    per_image: Positive = 3
+    occluded: Fraction = 0.5
+    seed: NonNegative = 0
+
+    def open(self) -> Dataset:
+        """The dataset. Raises BadInput when its folder cannot be written."""
+        chosen: dict[str, Any] = {k: v for k, v in asdict(self).items() if k not in ("root", "name")}  # type: ignore[call-overload]
+        root = Path(self.root).expanduser() / digest(chosen)[:8]
+        if not root.exists():
+            print(f"writing {self.images} images of {self.objects} procedural objects to {root}", flush=True)
+            try:
+                write_dataset(root, **chosen)
+            except OSError as error:
+                raise BadInput(
+                    "dataset.root", found=f"{root} ({error.strerror})", needed="a folder to write to"
+                ) from None
+        return open_dataset(root, name=self.name)

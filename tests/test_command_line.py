@@ -1,0 +1,233 @@
+"""The command line from end to end, on a small synthetic dataset that is written once."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Ran, run_dzop
+from PIL import Image
+
+from pipeline.bop.results import read_results
+from pipeline.synthetic.scenes import write_dataset
+
+SMALL = ("render.count=12", "render.size=128", "extract=hog", "overlays=false", "runtime.progress=false", "runtime.device=cpu")
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("synthetic") / "scene"
+    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
+    return root
+
+
+@pytest.fixture
+def dzop(capsys, monkeypatch, tmp_path, scene):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> Ran:
+        if arguments[0] == "cache":
+            return run_dzop(capsys, monkeypatch, *arguments)
+        dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", *SMALL)
+        options = next((i for i, a in enumerate(arguments) if "=" in a), 0)  # argparse wants options before overrides
+        return run_dzop(capsys, monkeypatch, *arguments[:options], *dataset, *arguments[options:])
+
+    return run
+
+
+def results(folder: Path) -> Path:
+    return next(folder.glob("results/*/*/poses.json")).parent
+
+
+def test_one_command_takes_a_dataset_to_poses_and_a_second_one_computes_nothing(dzop, tmp_path):
+    first = dzop("overlays=true")
+    assert first.status == 0
+    made = first.counts()[0]
+    assert made["templates"] == made["template features"] == (24, 0)
+    assert made["query features"] == made["poses"] == (4, 0)
+    folder = results(tmp_path)
+    rows = read_results(folder / "dzop-hog_toy-test.csv")
+    record = json.loads((folder / "poses.json").read_text())
+    assert len(record["answers"]) == 4
+    assert len(rows) == sum(answer["status"] == "estimate" for answer in record["answers"])
+    assert all(answer["status"] == "estimate" or (answer["stage"] and answer["reason"]) for answer in record["answers"])
+    pictures = sorted((folder / "overlays").glob("*.jpg"))
+    assert len(pictures) == 2
+    again = dzop("overlays=true").counts()[0]
+    assert {computed for computed, _ in again.values()} == {0}
+    assert {step: sum(counts) for step, counts in again.items()} == {step: sum(counts) for step, counts in made.items()}
+
+
+def test_the_same_run_gives_the_same_csv_but_for_its_times(dzop, tmp_path):
+    dzop("store.root=a", "out=a/results")
+    dzop("store.root=b", "out=b/results")
+    ours, theirs = (read_results(next((tmp_path / name).glob("results/*/*/*.csv"))) for name in "ab")
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a.T_cam_obj, b.T_cam_obj)
+        assert (a.scene_id, a.im_id, a.obj_id, a.score) == (b.scene_id, b.im_id, b.obj_id, b.score)
+
+
+def test_a_sweep_over_matching_parameters_touches_no_template_and_no_backbone(dzop):
+    ran = dzop("-m", "cluster.count=5,10", "fuse.dim=16,32")
+    assert ran.status == 0
+    first, *others = ran.counts()
+    assert first["templates"] == (24, 0)
+    assert len(others) == 3
+    for job in others:
+        assert [job[step] for step in ("templates", "template features", "query features")] == [(0, 24), (0, 24), (0, 4)]
+        assert job["poses"] == (4, 0)
+
+
+def test_one_more_layer_computes_only_that_layer(dzop):
+    dzop("step=onboard", "fuse.layers=[5,8]")
+    listed = dzop("cache", "ls").out
+    assert dzop("step=onboard", "fuse.layers=[5,8,11]").counts()[0]["template features"] == (24, 0)
+    paths = [line.split()[-1] for line in listed.splitlines()[1:]]
+    assert all(path in dzop("cache", "ls").out for path in paths)
+    assert "features/hog/t0/layer11" not in listed
+    assert "features/hog/t0/layer11" in dzop("cache", "du").out
+
+
+def test_a_plan_computes_nothing_and_shows_every_node(dzop, tmp_path):
+    plan = dzop("plan=true").out
+    assert not list(tmp_path.glob("cache/templates/*")) + list(tmp_path.glob("results/*"))
+    for line in ("templates: object 1  (12 views)", "template features: object 2 layer 11", "poses: scene 1 object 2"):
+        assert line in plan
+    dzop("step=all")
+    warm = dzop("plan=true").out
+    assert "missing" not in warm
+    assert "nodes cached" in warm
+
+
+def test_steps_stop_where_they_are_told(dzop, tmp_path):
+    assert set(dzop("step=onboard").counts()[0]) == {"templates", "template crops", "template features"}
+    assert set(dzop("step=detect").counts()[0]) == {"detections"}
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_part_of_the_targets_can_be_selected(dzop, tmp_path):
+    dzop("select.objects=[2]", "select.images=[0]")
+    answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
+    assert [(answer["im_id"], answer["obj_id"]) for answer in answers] == [(0, 2)]
+
+
+def test_one_bad_detection_is_recorded_and_the_run_goes_on(dzop, tmp_path, scene):
+    good = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [100, 80, 60, 60], "time": 0.1}
+    bad = {**good, "category_id": 2, "segmentation": {"size": [3, 3], "counts": [9]}}
+    Path("found.json").write_text(json.dumps([good, bad]))
+    ran = dzop("detect=json", "detect.path=found.json")
+    assert ran.status == 0
+    answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
+    reasons = {(a["im_id"], a["obj_id"]): a.get("reason") for a in answers}
+    assert set(reasons) == {(0, 1), (0, 2), (1, 1), (1, 2)}
+    assert "[3, 3]" in reasons[0, 2]
+    assert reasons[1, 1] == "object 1 was not detected in scene 1, image 1"
+
+
+def test_a_fallback_is_marked_as_one(dzop, tmp_path):
+    dzop("solve.min_inliers=100000", "fallback=true")
+    answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
+    assert all(answer["status"] == "estimate" and "rotation of template" in answer["fallback"] for answer in answers)
+    dzop("solve.min_inliers=100000", "out=strict")
+    answers = json.loads(next(tmp_path.glob("strict/*/*/poses.json")).read_text())["answers"]
+    assert {answer["status"] for answer in answers} == {"none"}
+
+
+def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, capsys, monkeypatch):
+    frame = scene / "test" / "000001"
+    K = json.loads((frame / "scene_camera.json").read_text())["0"]["cam_K"]
+    given = (
+        "dataset=photo", f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={frame}/rgb/000000.png",
+        f"dataset.K=[{K[0]},{K[4]},{K[2]},{K[5]}]", *SMALL[:3], "overlays=true", "runtime.progress=false",
+    )  # fmt: skip
+    mask = run_dzop(capsys, monkeypatch, *given, f"dataset.mask={frame}/mask_visib/000000_000000.png")
+    assert mask.status == 0, mask.err
+    assert "1 poses, 0 without" in mask.out or "0 poses, 1 without" in mask.out
+    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*/overlays/*.jpg"))) == 1
+    box = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,60]")
+    other = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,70]")
+    assert box.status == other.status == 0
+    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*"))) == 3  # another box is another run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("cluster.size=3",), "Could not override 'cluster.size'"),
+        (("+cluster.size=3",), "cluster.size: found an unknown field, needs one of: count"),
+        (("match=nearest",), "Could not find 'match/nearest' Available options in 'match': cosine masked_cosine"),
+        (("match.top_k=0",), "match.top_k: found 0, needs greater than or equal to 1"),
+        (("fuse.layers=[2,12]",), "12"),
+        (("match.layer=7",), "7"),
+        (("select.objects=[9]",), "select.objects: found [9], needs some of the targets' objects: 1, 2"),
+        (("step=cook",), "step: found 'cook', needs 'all', 'onboard', 'detect' or 'estimate'"),
+        (("detect=json",), "detect.path"),
+        (("detect=json", "detect.path=nowhere.json"), "nowhere.json"),
+        (("dataset.root=nowhere",), "nowhere: found no such folder"),
+        (("extract=stable_diffusion", "extract.weights=./nowhere"), "nowhere"),
+        (("store=s3", "store.url=bucket"), "store.url: found 'bucket', needs s3://bucket/prefix"),
+        (("match._target_=pipeline.nothing.Here",), "match._target_"),
+        (("detect=photo",), "dataset=photo"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(dzop, tmp_path, arguments, told):
+    ran = dzop(*arguments)
+    assert ran.status == 1
+    lines = [line for line in ran.err.splitlines() if line]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert told in lines[0]
+    assert not list(tmp_path.glob("cache/*/*/zarr.json"))
+
+
+def test_a_photograph_of_another_size_than_its_mask_is_told(dzop, tmp_path, scene, capsys, monkeypatch):
+    Image.new("L", (10, 10), 255).save("mask.png")
+    ran = run_dzop(
+        capsys, monkeypatch, "dataset=photo", f"dataset.mesh={scene}/models/obj_000001.ply", *SMALL[:3],
+        f"dataset.image={scene}/test/000001/rgb/000000.png", "dataset.K=[300,300,160,120]", "dataset.mask=mask.png",
+    )  # fmt: skip
+    assert "mask.png: found 10 x 10 pixels, needs those of the photograph, 320 x 240" in ran.err
+
+
+MATCHER = '''
+"""query features, template bank -> the first template, whatever the query."""
+from typing import ClassVar
+
+import torch
+
+from pipeline.items.matches import TemplateMatch
+from pipeline.spec import Spec, spec
+
+
+@spec
+class First(Spec):
+    kind: ClassVar[str] = "match.first"
+    layer: int = 2
+
+    def __call__(self, query, query_mask, bank, bank_mask):
+        return TemplateMatch(index=torch.tensor([0]), score=torch.tensor([1.0]), margin=0.0)
+'''
+
+
+def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "first.py").write_text(MATCHER)
+    (tmp_path / "conf" / "match").mkdir(parents=True)
+    (tmp_path / "conf" / "match" / "first.yaml").write_text("_target_: elsewhere.first.First\nlayer: 2\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ran = dzop("--config-dir", str(tmp_path / "conf"), "match=first")
+    assert ran.status == 0, ran.err
+    answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
+    assert {answer["template_id"] for answer in answers if answer["status"] == "estimate"} <= {0}
+    assert json.loads((results(tmp_path) / "poses.json").read_text())["config"]["match"]["_target_"] == "elsewhere.first.First"
+
+
+def test_cache_commands_list_measure_verify_and_clean(dzop):
+    dzop("step=onboard")
+    assert "12" in dzop("cache", "ls", "--long").out
+    assert "total" in dzop("cache", "du").out
+    assert "entries whole, 0 not" in dzop("cache", "verify").out
+    assert dzop("cache", "gc").out == "0 entries, 0 B\n"
+    assert dzop("cache", "gc", "--older-than", "0", "--dry-run").out.count("would remove") > 5
+    key = dzop("cache", "ls").out.split("/")[-1].strip()
+    assert '"recipe"' in dzop("cache", "path", key[:12]).out

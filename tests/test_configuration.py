@@ -1,0 +1,45 @@
+"""Every yaml of conf/ is its class: same fields, same defaults, one name for file, yaml and kind."""
+
+import importlib
+from dataclasses import MISSING, fields
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from pipeline.spec import _tuples
+
+CONF = Path(__file__).parents[1] / "conf"
+STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "detect")
+VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.yaml"))
+
+
+def loaded(path: Path) -> tuple[type, dict]:
+    values = OmegaConf.to_container(OmegaConf.load(path))
+    module, name = values.pop("_target_").rsplit(".", 1)
+    return getattr(importlib.import_module(module), name), values
+
+
+@pytest.mark.parametrize("path", VARIANTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_a_yaml_lists_every_field_of_its_class_with_the_default(path: Path):
+    cls, values = loaded(path)
+    assert set(values) == {field.name for field in fields(cls)}
+    for field in fields(cls):
+        default = field.default if field.default is not MISSING else field.default_factory()
+        assert (_tuples(values[field.name]), field.name) == (default, field.name)
+
+
+@pytest.mark.parametrize("path", VARIANTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_file_yaml_and_kind_share_one_name(path: Path):
+    cls, _ = loaded(path)
+    assert cls.__module__ == f"pipeline.stages.{path.parent.name}.{path.stem}"
+    assert cls.kind == f"{path.parent.name}.{path.stem}"
+
+
+def test_every_variant_of_a_stage_has_its_yaml():
+    root = CONF.parent / "pipeline" / "stages"
+    kinds = {f"{path.parent.name}/{path.stem}" for path in VARIANTS}
+    for stage in STAGES:
+        for path in (root / stage).glob("*.py"):
+            if f'kind: ClassVar[str] = "{stage}.{path.stem}"' in path.read_text():
+                assert f"{stage}/{path.stem}" in kinds
