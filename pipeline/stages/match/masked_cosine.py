@@ -21,7 +21,8 @@ class MaskedCosine(Spec):
 
     ``normalise``: what the sum is divided by. ``intersection``, the cells inside both masks, ignores how well the
     silhouettes agree; ``query``, the query's cells, makes a template pay for each cell of the query it does not cover;
-    ``union``, the cells inside either mask, also for each of its own that the query lacks, which an occluder may hide.
+    ``union``, the cells inside either mask, also for each of its own that the query lacks. On LM-O with HOG, the best
+    template was within 15 degrees of the view for 0.47, 0.44 and 0.48 of 283 visible masks.
     """
 
     kind: ClassVar[str] = "match.masked_cosine"
@@ -29,7 +30,7 @@ class MaskedCosine(Spec):
 
     layer: NonNegative = 8
     top_k: Positive = 5
-    normalise: Literal["intersection", "query", "union"] = "query"
+    normalise: Literal["intersection", "query", "union"] = "union"
 
     def __call__(
         self,
