@@ -15,7 +15,7 @@ from pipeline.functional import camera, rigid
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import NonNegative, PositiveFloat, Runtime, Spec, spec
-from pipeline.stages.extract.grid import cells_of
+from pipeline.stages.extract.grid import CELLS, cells_of
 
 
 @spec
@@ -23,7 +23,8 @@ class Coordinates(Spec):
     """Random Fourier features of the object point that each cell's centre sees; background cells are zero.
 
     The cosine of two cells d mm apart on the object is exp(-d^2 / (2 bandwidth_mm^2)) in expectation over the
-    frequencies (Rahimi and Recht, NeurIPS 2007), with a standard error of at most channels^(-1/2).
+    frequencies (Rahimi and Recht, NeurIPS 2007), with a standard error of at most channels^(-1/2). A coarser layer has
+    a bandwidth as many times larger as its cells are, so that its maps can be interpolated between cells.
     """
 
     kind: ClassVar[str] = "extract.coordinates"
@@ -60,7 +61,8 @@ class CoordinatesBackbone:
 
     def _maps(self, crops: Crops, cells: int) -> Float32[np.ndarray, "n c h w"]:
         points = [cell_points(crops, i, cells=cells) for i in range(len(crops))]
-        features = np.stack([fourier_features(xyz, self.frequencies) * seen[:, None] for xyz, seen in points])
+        frequencies = self.frequencies * cells / max(CELLS.values())
+        features = np.stack([fourier_features(xyz, frequencies) * seen[:, None] for xyz, seen in points])
         return features.reshape(len(crops), cells, cells, -1).transpose(0, 3, 1, 2).astype(np.float32)
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad, unfold
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, Spec, spec
-from pipeline.stages.extract.grid import cells_of
+from pipeline.stages.extract.grid import CELLS, cells_of
 
 
 @spec
@@ -35,7 +35,7 @@ class Hog(Spec):
     timestep: ClassVar[int] = 0
 
     orientations: Positive = 8
-    signed: bool = False
+    signed: bool = True
     context_cells: NonNegative = 1
     silhouette: Fraction = 1.0
     contrast: PositiveFloat = 0.02
@@ -65,18 +65,14 @@ class HogBackbone:
         """Maps of the given layers, float32."""
         cells = {layer: cells_of(layer) for layer in layers}
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for x in (crops.rgb, crops.mask))
-        energy = oriented_energy(
-            rgb,
-            mask,
-            orientations=self.spec.orientations,
-            signed=self.spec.signed,
-            silhouette=self.spec.silhouette,
-        )
-        return {k: self._map(energy, cells=n) for k, n in cells.items()}
+        s = self.spec
+        energy = oriented_energy(rgb, mask, orientations=s.orientations, signed=s.signed, silhouette=s.silhouette)
+        # always through the finest cells: a layer has the same bytes whichever others are asked for
+        finest = cell_means(energy, cells=max(CELLS.values()))
+        return {k: self._map(cell_means(finest, cells=n)) for k, n in cells.items()}
 
-    def _map(self, energy: Float[Tensor, "n o S S"], *, cells: int) -> Float[Tensor, "n c h w"]:
-        histograms = pooled(energy, cells=cells)
-        return with_context(histograms, distance=self.spec.context_cells, contrast=self.spec.contrast)
+    def _map(self, histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n c h w"]:
+        return with_context(smoothed(histograms), distance=self.spec.context_cells, contrast=self.spec.contrast)
 
 
 def oriented_energy(
@@ -91,38 +87,51 @@ def oriented_energy(
 
     Central differences, no smoothing, of the colour channel with the strongest gradient (Dalal and Triggs, Sec. 6.2).
     """
-    image = rgb.permute(0, 3, 1, 2).float() / 255
+    image = rgb.permute(0, 3, 1, 2).float()  # whole numbers: two channels that tie do so exactly
     dx, dy = (_difference(image, axis=axis) for axis in (3, 2))
-    strongest = (dx.square() + dy.square()).argmax(dim=1, keepdim=True)
-    dx, dy = dx.gather(1, strongest)[:, 0], dy.gather(1, strongest)[:, 0]
-    magnitude = torch.hypot(dx, dy) * torch.where(_at_border(mask), silhouette, 1.0)
+    length = torch.hypot(dx, dy)
+    magnitude, strongest = length.max(dim=1, keepdim=True)
+    dx, dy, magnitude = dx.gather(1, strongest)[:, 0], dy.gather(1, strongest)[:, 0], magnitude[:, 0]
+    magnitude = magnitude / 255 * torch.where(_at_border(mask), silhouette, 1.0)
     turn = 2 * math.pi if signed else math.pi
     place = torch.atan2(dy, dx).remainder(turn) * (orientations / turn)
-    bins = torch.arange(orientations, device=rgb.device).view(1, -1, 1, 1)
-    apart = (place[:, None] - bins).abs()
-    share = 1 - torch.minimum(apart, orientations - apart)
-    return share.clamp_(min=0) * magnitude[:, None]
+    share = place.frac() * magnitude
+    lower = place.long() % orientations
+    energy = torch.zeros(len(rgb), orientations, *mask.shape[1:], device=rgb.device)
+    energy.scatter_(1, lower[:, None], (magnitude - share)[:, None])
+    return energy.scatter_(1, ((lower + 1) % orientations)[:, None], share[:, None])
 
 
-def pooled(energy: Float[Tensor, "n o S S"], *, cells: int) -> Float[Tensor, "n o h w"]:
-    """Mean energy per cell, smoothed over its neighbours by (1 2 1) / 4: windows that overlap, twice a cell wide."""
+def cell_means(energy: Float[Tensor, "n o S S"], *, cells: int) -> Float[Tensor, "n o h w"]:
+    """Mean energy per cell; a crop whose side is no multiple of the cells is enlarged to one first."""
     size = energy.shape[-1]
     if size % cells:
-        energy = interpolate(energy, (cells * math.ceil(size / cells),) * 2, mode="bilinear", align_corners=False)
-    mean = avg_pool2d(energy, energy.shape[-1] // cells)
-    kernel = torch.tensor([0.25, 0.5, 0.25], device=energy.device)
-    flat = mean.flatten(0, 1)[:, None]
-    flat = conv2d(conv2d(flat, kernel.view(1, 1, 1, 3), padding=(0, 1)), kernel.view(1, 1, 3, 1), padding=(1, 0))
-    return flat.view_as(mean)
+        size = cells * math.ceil(size / cells)
+        energy = interpolate(energy, (size, size), mode="bilinear", align_corners=False)
+    return avg_pool2d(energy, size // cells)
+
+
+def smoothed(histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n o h w"]:
+    """Weighted (1 2 1) / 4 with the neighbours along both axes: windows twice a cell wide that overlap by half."""
+    h, w = histograms.shape[2:]
+    x = pad(histograms, (1, 1, 1, 1))
+    x = (x.narrow(3, 0, w) + 2 * x.narrow(3, 1, w) + x.narrow(3, 2, w)) / 4
+    return (x.narrow(2, 0, h) + 2 * x.narrow(2, 1, h) + x.narrow(2, 2, h)) / 4
 
 
 def with_context(histograms: Float[Tensor, "n o h w"], *, distance: int, contrast: float) -> Float[Tensor, "n c h w"]:
-    """Each cell's histogram beside those of 8 neighbours, scaled to length 1 where energy exceeds ``contrast``."""
-    n, _, h, w = histograms.shape
-    if distance:
-        histograms = unfold(histograms, 3, dilation=distance, padding=distance).view(n, -1, h, w)
-    length = histograms.square().sum(1, keepdim=True)
-    return histograms / (length + contrast**2).sqrt()
+    """Each cell's histogram beside those of 8 neighbours, all scaled by one number to a length of 1 where energy is.
+
+    The length is sqrt(energy^2 + ``contrast``^2): flat cells stay near zero (L2 norm of Dalal and Triggs, Sec. 6.4).
+    """
+    h, w = histograms.shape[2:]
+    x = pad(histograms, (distance,) * 4)
+    steps = (0, distance, 2 * distance) if distance else (0,)
+    shifts = [(i, j) for i in steps for j in steps]
+    energy = x.square().sum(1, keepdim=True)
+    energy = torch.stack([energy[:, :, i : i + h, j : j + w] for i, j in shifts]).sum(0)
+    x = torch.cat([x[:, :, i : i + h, j : j + w] for i, j in shifts], dim=1)
+    return x.mul_((energy + contrast**2).rsqrt())
 
 
 def _difference(image: Float[Tensor, "n 3 S S"], *, axis: int) -> Float[Tensor, "n 3 S S"]:
