@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -59,8 +59,7 @@ def _hydra_main(config: DictConfig) -> None:
 
 def _job(config: DictConfig) -> None:
     # one plain dict, so that nothing below knows OmegaConf
-    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    assert isinstance(values, dict)
+    values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     run(
         stages=stages_of(values),
         dataset=variant(values["dataset"], "dataset"),
@@ -102,7 +101,7 @@ def variant(values: Mapping[str, Any], where: str) -> Any:
         raise BadInput(
             f"{where}._target_", found=f"{target!r} ({error})", needed="the import path of a class"
         ) from None
-    chosen = build(cls, fields, where=where)
+    chosen: Any = build(cls, fields, where=where)
     return chosen.resolve() if hasattr(chosen, "resolve") else chosen
 
 

@@ -22,7 +22,7 @@ def cache_command(arguments: list[str]) -> None:
     ls = commands.add_parser("ls", parents=[place], help="every entry: state, rows, size, age, what it is")
     ls.add_argument("--long", action="store_true", help="also what each entry was made from")
     commands.add_parser("du", parents=[place], help="bytes by folder")
-    commands.add_parser("verify", parents=[place], help="read every byte and check it; damaged entries are marked incomplete")
+    commands.add_parser("verify", parents=[place], help="read and check every byte; damaged entries become incomplete")
     gc = commands.add_parser("gc", parents=[place], help="remove incomplete entries, and old ones if asked")
     gc.add_argument("--older-than", type=float, metavar="DAYS", help="also complete entries older than this")
     gc.add_argument("--dry-run", action="store_true", help="only say what would go")

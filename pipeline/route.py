@@ -148,7 +148,7 @@ class Clock:
 
 
 def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
-    """The online route. Raises NoPose when no template can be compared; a template that leads nowhere keeps its reason."""
+    """The online route. Raises NoPose when no template can be compared; one that leads nowhere keeps its reason."""
     clock = Clock()
     with clock("match"):
         match = stages.match(query.features[stages.match.layer], query.mask, bank.features, bank.mask)
@@ -199,7 +199,7 @@ def _lifted(
 
 
 def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:
-    """T_cam_obj from a template alone: its rotation, and the translation that puts it where and as large as the crop is.
+    """T_cam_obj from a template alone: its rotation, and the translation that fits place and size of the crop.
 
     The object's origin keeps its place in the crop; depth scales with focal length times crop magnification; the
     rotation is turned with the viewing ray, so that the object looks the same from its new place in the image.

@@ -66,7 +66,7 @@ class Select:
 
 @spec
 class Options:
-    """What to do and where to write. ``label`` names the variant of every stage, ``config`` is the whole configuration."""
+    """What to do and where to write. ``label``: the variant of every stage; ``config``: the whole configuration."""
 
     step: Literal["all", "onboard", "detect", "estimate"]
     plan: bool
@@ -100,6 +100,7 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     data = dataset.open()
     targets = options.select.of(data)
     graph = Graph(Context(stages, data, targets, store, runtime, Tally(runtime.progress)))
+    graph.check()
     print(_headline(options, stages, data, targets, store), flush=True)
     if options.plan:
         print(plan_table(graph.plan()))
@@ -133,7 +134,9 @@ def plan_table(nodes: Sequence[Node]) -> str:
     lines = [f"{'state':<9}{'size':>10}  {'key':<{KEY_DIGITS}}  node"]
     for node in nodes:
         cost = f"  ({node.cost})" if node.cost else ""
-        lines.append(f"{node.state:<9}{human(node.nbytes):>10}  {node.ref.key[:KEY_DIGITS]}  {node.step}: {node.of}{cost}")
+        lines.append(
+            f"{node.state:<9}{human(node.nbytes):>10}  {node.ref.key[:KEY_DIGITS]}  {node.step}: {node.of}{cost}"
+        )
     for state in sorted({node.state for node in nodes}):
         mine = [node for node in nodes if node.state == state]
         lines.append(f"{len(mine)} nodes {state}, {human(sum(node.nbytes for node in mine))}")
@@ -166,7 +169,11 @@ def _judged(graph: Graph, answer: Answer) -> Judged | None:
     data = graph.run.dataset
     if isinstance(answer, NoEstimate) or not data.has_ground_truth(answer.scene_id):
         return None
-    truths = {i: gt.T_cam_obj for i, gt in enumerate(data.ground_truth(answer.scene_id, answer.im_id)) if gt.obj_id == answer.obj_id}
+    truths = {
+        i: gt.T_cam_obj
+        for i, gt in enumerate(data.ground_truth(answer.scene_id, answer.im_id))
+        if gt.obj_id == answer.obj_id
+    }
     return judge(answer, truths, graph.run.model(answer.obj_id)) if truths else None
 
 

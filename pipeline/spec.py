@@ -17,7 +17,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from hashlib import sha256
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, dataclass_transform
 
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
@@ -36,7 +36,17 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 def spec(cls: type[T]) -> type[T]:
     """Frozen, keyword-only dataclass whose fields are checked strictly (no "1" for 1, no True for 1)."""
     config = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
-    return checked_dataclass(frozen=True, kw_only=True, config=config)(cls)
+    return checked_dataclass(frozen=True, kw_only=True, config=config)(cls)  # type: ignore[return-value]
+
+
+class Variant(Protocol):
+    """What the cached graph asks of any stage: a name, and all that its results depend on but its inputs."""
+
+    kind: ClassVar[str]
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe."""
+        ...
 
 
 class Spec:
@@ -117,7 +127,7 @@ class Runtime:
     progress: bool = True
 
     def torch_device(self) -> str:
-        """ "auto" resolved. Raises BadInput when CUDA is asked for and absent."""
+        """Torch's name of the device. Raises BadInput when CUDA is asked for and absent."""
         import torch
 
         if self.device == "auto":

@@ -50,7 +50,8 @@ class Tally:
     @contextmanager
     def bar(self, total: int, title: str, unit: str) -> Iterator[Callable[[int], None]]:
         """A progress bar that appears after three seconds; yields the function that moves it."""
-        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=not self.progress, dynamic_ncols=True) as bar:
+        hidden = None if self.progress else True  # None: hidden where stderr is no terminal
+        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=hidden, dynamic_ncols=True) as bar:
             yield lambda rows: (bar.update(rows), None)[1]
 
     def table(self) -> str:

@@ -11,7 +11,14 @@ from PIL import Image
 from pipeline.bop.results import read_results
 from pipeline.synthetic.scenes import write_dataset
 
-SMALL = ("render.count=12", "render.size=128", "extract=hog", "overlays=false", "runtime.progress=false", "runtime.device=cpu")
+SMALL = (
+    "render.count=12",
+    "render.size=128",
+    "extract=hog",
+    "overlays=false",
+    "runtime.progress=false",
+    "runtime.device=cpu",
+)
 
 
 @pytest.fixture(scope="session")
@@ -19,6 +26,12 @@ def scene(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("synthetic") / "scene"
     write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
     return root
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory, scene) -> Path:
+    """Templates and features of the small dataset, for the tests that are not about making them."""
+    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture
@@ -74,7 +87,11 @@ def test_a_sweep_over_matching_parameters_touches_no_template_and_no_backbone(dz
     assert first["templates"] == (24, 0)
     assert len(others) == 3
     for job in others:
-        assert [job[step] for step in ("templates", "template features", "query features")] == [(0, 24), (0, 24), (0, 4)]
+        assert [job[step] for step in ("templates", "template features", "query features")] == [
+            (0, 24),
+            (0, 24),
+            (0, 4),
+        ]
         assert job["poses"] == (4, 0)
 
 
@@ -105,17 +122,17 @@ def test_steps_stop_where_they_are_told(dzop, tmp_path):
     assert not (tmp_path / "results").exists()
 
 
-def test_a_part_of_the_targets_can_be_selected(dzop, tmp_path):
-    dzop("select.objects=[2]", "select.images=[0]")
+def test_a_part_of_the_targets_can_be_selected(dzop, tmp_path, cache):
+    dzop(f"store.root={cache}", "select.objects=[2]", "select.images=[0]")
     answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
     assert [(answer["im_id"], answer["obj_id"]) for answer in answers] == [(0, 2)]
 
 
-def test_one_bad_detection_is_recorded_and_the_run_goes_on(dzop, tmp_path, scene):
+def test_one_bad_detection_is_recorded_and_the_run_goes_on(dzop, tmp_path, scene, cache):
     good = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [100, 80, 60, 60], "time": 0.1}
     bad = {**good, "category_id": 2, "segmentation": {"size": [3, 3], "counts": [9]}}
     Path("found.json").write_text(json.dumps([good, bad]))
-    ran = dzop("detect=json", "detect.path=found.json")
+    ran = dzop(f"store.root={cache}", "detect=json", "detect.path=found.json")
     assert ran.status == 0
     answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
     reasons = {(a["im_id"], a["obj_id"]): a.get("reason") for a in answers}
@@ -124,11 +141,11 @@ def test_one_bad_detection_is_recorded_and_the_run_goes_on(dzop, tmp_path, scene
     assert reasons[1, 1] == "object 1 was not detected in scene 1, image 1"
 
 
-def test_a_fallback_is_marked_as_one(dzop, tmp_path):
-    dzop("solve.min_inliers=100000", "fallback=true")
+def test_a_fallback_is_marked_as_one(dzop, tmp_path, cache):
+    dzop(f"store.root={cache}", "solve.min_inliers=100000", "fallback=true")
     answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
     assert all(answer["status"] == "estimate" and "rotation of template" in answer["fallback"] for answer in answers)
-    dzop("solve.min_inliers=100000", "out=strict")
+    dzop(f"store.root={cache}", "solve.min_inliers=100000", "out=strict")
     answers = json.loads(next(tmp_path.glob("strict/*/*/poses.json")).read_text())["answers"]
     assert {answer["status"] for answer in answers} == {"none"}
 
@@ -209,17 +226,20 @@ class First(Spec):
 '''
 
 
-def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch):
+def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "first.py").write_text(MATCHER)
     (tmp_path / "conf" / "match").mkdir(parents=True)
     (tmp_path / "conf" / "match" / "first.yaml").write_text("_target_: elsewhere.first.First\nlayer: 2\n")
     monkeypatch.syspath_prepend(tmp_path)
-    ran = dzop("--config-dir", str(tmp_path / "conf"), "match=first")
+    ran = dzop("--config-dir", str(tmp_path / "conf"), f"store.root={cache}", "match=first")
     assert ran.status == 0, ran.err
     answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
     assert {answer["template_id"] for answer in answers if answer["status"] == "estimate"} <= {0}
-    assert json.loads((results(tmp_path) / "poses.json").read_text())["config"]["match"]["_target_"] == "elsewhere.first.First"
+    assert (
+        json.loads((results(tmp_path) / "poses.json").read_text())["config"]["match"]["_target_"]
+        == "elsewhere.first.First"
+    )
 
 
 def test_cache_commands_list_measure_verify_and_clean(dzop):

@@ -24,7 +24,15 @@ class Outer(Spec):
 
 
 def test_every_field_enters_the_recipe():
-    recipe = {"kind": "match.toy", "version": 1, "layer": 2, "weight": 1.0, "layers": [2, 5], "mode": "total", "flag": True}
+    recipe = {
+        "kind": "match.toy",
+        "version": 1,
+        "layer": 2,
+        "weight": 1.0,
+        "layers": [2, 5],
+        "mode": "total",
+        "flag": True,
+    }
     assert Toy().recipe() == recipe
 
 
@@ -69,5 +77,5 @@ def test_a_wrong_field_is_told_in_one_line(values: dict, message: str):
 
 
 def test_a_missing_field_is_named():
-    with pytest.raises(BadInput, match="outer.first"):
+    with pytest.raises(BadInput, match=r"outer\.first"):
         build(Outer, {}, where="outer")

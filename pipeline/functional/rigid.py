@@ -56,7 +56,7 @@ def look_at(eye: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:
 
 
 def rotation_between(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that turns direction ``a`` into direction ``b`` (Rodrigues; not for opposite directions)."""
+    """The smallest rotation that turns direction ``a`` into ``b`` (Rodrigues; not for opposite directions)."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     v = np.cross(a, b)
     V = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -28,6 +28,11 @@ class Graph:
         self.queries = QueryNodes(run)
         self.poses = PoseNodes(run, self.templates, self.queries)
 
+    def check(self) -> None:
+        """Raise BadInput for a layer the extractor does not have, or weights that are not there, before any work."""
+        for layer in self.run.stages.layers:
+            self.run.stages.extract.feature_shape(layer)
+
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
         for obj_id in self.run.object_ids:
@@ -39,6 +44,7 @@ class Graph:
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
+        self.detect()  # first: a fault in its files must not wait for hours of onboarding
         self.onboard()
         return self.poses.estimate()
 

@@ -100,7 +100,7 @@ class QueryNodes:
         return self.run.features(layer, inputs)
 
     def make_crops(self, image: ImageId) -> list[Found]:
-        """Crop what is missing of an image's detections; those that cannot be cropped are left out, with their reason."""
+        """Crop an image's detections; those that cannot be cropped are left out, with their reason."""
         ref = self.crops(image)
         if self.run.store.complete(ref):
             self.run.tally.add("query crops", reused=self.run.store.read(ref).rows)

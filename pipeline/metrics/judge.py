@@ -45,7 +45,7 @@ class Judged:
 
 def judge(estimate: PoseEstimate, truths: Mapping[int, Float[np.ndarray, "4 4"]], model: ObjectModel) -> Judged:
     """Errors against the instance the detection was made of, or else the one with the smallest MSSD."""
-    if estimate.gt_id in truths:
+    if estimate.gt_id is not None and estimate.gt_id in truths:
         truths = {estimate.gt_id: truths[estimate.gt_id]}
     outer = _outer_vertices(model.mesh.vertices)
     errors = {gt_id: mssd(estimate.T_cam_obj, T, outer, model.symmetries) for gt_id, T in truths.items()}
@@ -57,7 +57,7 @@ def judge(estimate: PoseEstimate, truths: Mapping[int, Float[np.ndarray, "4 4"]]
 
 
 def _outer_vertices(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "h 3"]:
-    """Vertices of the convex hull: a distance between two rigid placements is largest there, so MSSD is exact on them."""
+    """Vertices of the convex hull, where distances between two placements are largest: MSSD is exact on them."""
     try:
         return vertices[ConvexHull(vertices).vertices]
     except QhullError:  # a flat object has no hull in 3D

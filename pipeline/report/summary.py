@@ -45,13 +45,13 @@ def objects_table(rows: Sequence[Checked]) -> str:
     lines = [f"{'object':>6}{'answers':>9}{'poses':>7}{'rotation':>12}{'shift':>9}{'MSSD/diam':>11}{'right':>8}"]
     for obj_id, mine in [*sorted(groups.items()), ("all", list(rows))]:
         poses = sum(not isinstance(answer, NoEstimate) for answer, _ in mine)
-        judged = [j for _, j in mine if j is not None]
+        errors = [j for _, j in mine if j is not None]
         line = f"{obj_id:>6}{len(mine):>9}{poses:>7}"
-        if judged:
-            relative = np.array([j.relative_mssd for j in judged])
-            line += f"{np.median([j.rotation_deg for j in judged]):>8.1f} deg"
-            line += f"{np.median([j.translation_mm for j in judged]):>6.0f} mm{np.median(relative):>11.0%}"
-            line += f"{sum(j.correct for j in judged) / len(mine):>8.0%}"
+        if errors:
+            relative = np.array([j.relative_mssd for j in errors])
+            line += f"{np.median([j.rotation_deg for j in errors]):>8.1f} deg"
+            line += f"{np.median([j.translation_mm for j in errors]):>6.0f} mm{np.median(relative):>11.0%}"
+            line += f"{sum(j.correct for j in errors) / len(mine):>8.0%}"
         lines.append(line)
     return "\n".join(
         [*lines, f"medians over poses; right: share of all answers with MSSD below {CORRECT_MSSD:.0%} of the diameter"]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -65,7 +65,7 @@ Rows = Mapping[str, Mapping[str, np.ndarray]]
 
 
 class Store:
-    """The feature store. route.py is its only caller; a step that does without it computes the same values."""
+    """The feature store. pipeline/graph is its only caller; a step that does without it computes the same values."""
 
     def __init__(self, config: StoreConfig, announce: Callable[[str], None] = lambda text: None) -> None:
         self.backend: Backend = config.open()
@@ -162,14 +162,15 @@ class Store:
                 _finish(group, ref, arrays[ref], dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
         return Filled(computed, rows - computed, seconds)
 
+    def _announce_for(self, ref: Ref, text: str) -> None:
+        self.announce(f"{ref.path}: {text}")
+
     @contextmanager
     def _exclusive(self, refs: Sequence[Ref]):
         """Locks of the entries, taken in one order by all; a full disk told in one line."""
         with ExitStack() as stack:
             for ref in sorted(refs, key=lambda ref: ref.path):
-                stack.enter_context(
-                    self.backend.lock(ref.key, lambda text, ref=ref: self.announce(f"{ref.path}: {text}"))
-                )
+                stack.enter_context(self.backend.lock(ref.key, partial(self._announce_for, ref)))
             try:
                 yield
             except OSError as error:

@@ -32,7 +32,7 @@ class DemoConfig(Spec):
 
     def open(self) -> Dataset:
         """The dataset. Raises BadInput when its folder cannot be written."""
-        chosen: dict[str, Any] = {k: v for k, v in asdict(self).items() if k not in ("root", "name")}  # type: ignore[call-overload]
+        chosen: dict[str, Any] = {k: v for k, v in asdict(self).items() if k not in ("root", "name")}
         root = Path(self.root).expanduser() / digest(chosen)[:8]
         if not root.exists():
             print(f"writing {self.images} images of {self.objects} procedural objects to {root}", flush=True)

@@ -98,7 +98,9 @@ def test_a_layer_that_is_there_is_left_alone_when_another_is_added(store: Store)
 
 
 def test_a_row_of_zeros_is_a_row_like_any_other(store: Store):
-    store.fill({REF: LAYOUT}, rows=2, batch=2, compute=lambda rows: {REF.key: {"maps": np.zeros((2, 3, 4), np.float16)}})
+    store.fill(
+        {REF: LAYOUT}, rows=2, batch=2, compute=lambda rows: {REF.key: {"maps": np.zeros((2, 3, 4), np.float16)}}
+    )
     np.testing.assert_array_equal(store.read(REF).array("maps"), np.zeros((2, 3, 4)))
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Protocol
 
 from pipeline.items.features import Clusters, FusedPair
+from pipeline.spec import Variant
 
 
-class Clusterer(Protocol):
+class Clusterer(Variant, Protocol):
     """What a cluster variant is."""
 
     def __call__(self, pair: FusedPair) -> Clusters:

@@ -6,9 +6,10 @@ from typing import Protocol
 
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences
+from pipeline.spec import Variant
 
 
-class Corresponder(Protocol):
+class Corresponder(Variant, Protocol):
     """What a correspond variant is. ``crop_size``: side S of the crops in pixels."""
 
     def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:

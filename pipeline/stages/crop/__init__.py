@@ -7,8 +7,10 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.spec import Variant
 
-class Cropper(Protocol):
+
+class Cropper(Variant, Protocol):
     """What a crop variant is. ``size``: side S of the crop in pixels. The same protocol serves template and query."""
 
     size: int

@@ -8,9 +8,10 @@ from typing import Protocol
 
 from pipeline.bop.dataset import Dataset
 from pipeline.items.views import Detection, Target
+from pipeline.spec import Variant
 
 
-class Detector(Protocol):
+class Detector(Variant, Protocol):
     """What a detect variant is."""
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:

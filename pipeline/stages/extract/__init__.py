@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Runtime
+from pipeline.spec import Runtime, Variant
 
 
 class Backbone(Protocol):
@@ -20,7 +20,7 @@ class Backbone(Protocol):
         ...
 
 
-class Extractor(Protocol):
+class Extractor(Variant, Protocol):
     """What an extract variant is: a spec that can say what it would give before any weight is loaded.
 
     ``needs_geometry``: True only for oracles; their crops carry Geometry. ``notice``: what a user must know of the
@@ -38,10 +38,6 @@ class Extractor(Protocol):
     @property
     def timestep(self) -> int:
         """Diffusion timestep; 0 for models that have none."""
-        ...
-
-    def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe, weights by digest."""
         ...
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:

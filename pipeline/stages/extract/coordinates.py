@@ -17,14 +17,17 @@ from pipeline.items.views import Crops
 from pipeline.spec import NonNegative, PositiveFloat, Runtime, Spec, spec
 from pipeline.stages.extract.grid import CELLS, cells_of
 
+FINEST = max(CELLS.values())
+
 
 @spec
 class Coordinates(Spec):
     """Random Fourier features of the object point that each cell's centre sees; background cells are zero.
 
     The cosine of two cells d mm apart on the object is exp(-d^2 / (2 bandwidth_mm^2)) in expectation over the
-    frequencies (Rahimi and Recht, NeurIPS 2007), with a standard error of at most channels^(-1/2). A coarser layer has
-    a bandwidth as many times larger as its cells are, so that its maps can be interpolated between cells.
+    frequencies (Rahimi and Recht, NeurIPS 2007), with a standard error of at most channels^(-1/2).
+    All layers have the finest layer's cells, since interpolating coarse maps would add errors that are not geometry's;
+    each has frequencies of its own.
     """
 
     kind: ClassVar[str] = "extract.coordinates"
@@ -35,12 +38,13 @@ class Coordinates(Spec):
     timestep: ClassVar[int] = 0
 
     bandwidth_mm: PositiveFloat = 10.0
-    channels: Annotated[int, Field(ge=2, multiple_of=2)] = 128
+    channels: Annotated[int, Field(ge=2, multiple_of=2)] = 64
     seed: NonNegative = 0
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
-        return self.channels, cells_of(layer), cells_of(layer)
+        cells_of(layer)
+        return self.channels, FINEST, FINEST
 
     def load(self, runtime: Runtime) -> CoordinatesBackbone:
         """Nothing to load."""
@@ -52,18 +56,20 @@ class CoordinatesBackbone:
 
     def __init__(self, spec: Coordinates, runtime: Runtime) -> None:
         self.device, self.batch = torch.device(runtime.torch_device()), runtime.batch or 64
-        draws = np.random.default_rng(spec.seed).standard_normal((3, spec.channels // 2))
-        self.frequencies = draws / spec.bandwidth_mm
+        self.spec = spec
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32. Raises BadInput for crops without geometry."""
-        return {layer: torch.from_numpy(self._maps(crops, cells_of(layer))).to(self.device) for layer in layers}
+        views = [cell_points(crops, i, cells=FINEST) for i in range(len(crops))]
+        return {layer: torch.from_numpy(self._maps(views, layer)).to(self.device) for layer in layers}
 
-    def _maps(self, crops: Crops, cells: int) -> Float32[np.ndarray, "n c h w"]:
-        points = [cell_points(crops, i, cells=cells) for i in range(len(crops))]
-        frequencies = self.frequencies * cells / max(CELLS.values())
-        features = np.stack([fourier_features(xyz, frequencies) * seen[:, None] for xyz, seen in points])
-        return features.reshape(len(crops), cells, cells, -1).transpose(0, 3, 1, 2).astype(np.float32)
+    def _maps(
+        self, views: Sequence[tuple[Float[np.ndarray, "hw 3"], Bool[np.ndarray, " hw"]]], layer: int
+    ) -> Float32[np.ndarray, "n c h w"]:
+        draws = np.random.default_rng([self.spec.seed, layer]).standard_normal((3, self.spec.channels // 2))
+        frequencies = draws / self.spec.bandwidth_mm
+        features = np.stack([fourier_features(xyz, frequencies) * seen[:, None] for xyz, seen in views])
+        return features.reshape(len(views), FINEST, FINEST, -1).transpose(0, 3, 1, 2).astype(np.float32)
 
 
 def cell_points(crops: Crops, i: int, *, cells: int) -> tuple[Float[np.ndarray, "hw 3"], Bool[np.ndarray, " hw"]]:

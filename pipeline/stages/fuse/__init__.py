@@ -13,12 +13,12 @@ from torch import Tensor
 from pipeline.errors import NoPose
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.items.features import FusedPair
-from pipeline.spec import NonNegative
+from pipeline.spec import NonNegative, Variant
 
 Layers = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 
 
-class Fuser(Protocol):
+class Fuser(Variant, Protocol):
     """What a fuse variant is. ``layers``: the decoder layers it needs; masks are those of the crops (S S)."""
 
     layers: tuple[int, ...]

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.items.matches import TemplateMatch
+from pipeline.spec import Variant
 
 
-class Matcher(Protocol):
+class Matcher(Variant, Protocol):
     """What a match variant is. ``layer``: the decoder layer it compares; masks are those of the crops (S S)."""
 
     layer: int

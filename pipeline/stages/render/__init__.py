@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from pipeline.items.objects import Mesh
+from pipeline.spec import Variant
 
 
-class Renderer(Protocol):
+class Renderer(Variant, Protocol):
     """What a render variant is: a spec that knows its cameras and draws them.
 
     rgb is black where depth is 0; depth is float32 mm along the optical axis; pixel centres are integers.

@@ -11,12 +11,13 @@ from pydantic import Field
 from pipeline.errors import NoPose
 from pipeline.functional.pnp import polished, reprojection_error_px
 from pipeline.items.poses import PoseSolution
+from pipeline.spec import Variant
 
 Confidence = Annotated[float, Field(gt=0, lt=1)]
 PnpPoints = Annotated[int, Field(ge=4)]  # three points leave up to four poses
 
 
-class Solver(Protocol):
+class Solver(Variant, Protocol):
     """What a solve variant is."""
 
     def __call__(
