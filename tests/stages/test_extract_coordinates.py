@@ -70,7 +70,8 @@ def test_cosine_is_a_gaussian_of_the_distance() -> None:
     spec = Coordinates(bandwidth_mm=20.0, channels=4096)
     crops = plane_view(pose(0))
     features = spec.load(CPU)(crops, [8])[8][0].flatten(1).T
-    points, seen = cell_points(crops, 0, cells=32)
+    points, seen = cell_points(crops, 0, cells=64)
+    seen[np.arange(len(seen)) % 7 > 0] = False
     distance = np.linalg.norm(points[seen][:, None] - points[seen][None], axis=-1)
     cosine = (features[seen] @ features[seen].T).numpy()
     # 2048 random frequencies: standard error 1/sqrt(2 x 2048) = 0.016, the largest of some 10^5 pairs 5 of them

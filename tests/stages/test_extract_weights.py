@@ -171,6 +171,7 @@ def test_pickled_weights_are_never_opened(folder: Path, tmp_path: Path) -> None:
         ("unet/config.json", {"layers_per_block": [1, 2, 2, 2]}, "layers_per_block [1, 2, 2, 2]"),
         ("unet/config.json", {"norm_num_groups": 7}, "needs a config of UNet2DConditionModel"),
         ("vae/config.json", {"_class_name": "VQModel"}, "found _class_name 'VQModel', needs AutoencoderKL"),
+        ("vae/config.json", {"block_out_channels": None}, "found no block_out_channels"),
         ("text_encoder/config.json", {"hidden_size": 768}, "found hidden_size 768, needs 32"),
         (
             "scheduler/scheduler_config.json",

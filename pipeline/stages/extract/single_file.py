@@ -23,6 +23,7 @@ from pipeline.stages.extract.weights import (
     empty_model,
     empty_prompt,
     empty_text_encoder,
+    fill,
     last_hidden_state,
     tensor_shapes,
     without_decoder,
@@ -84,7 +85,10 @@ class SingleFile:
 
         config = self.architecture().unet
         model = empty_model(UNet2DConditionModel, config, dtype, self.path)
-        return self._filled(model, convert_ldm_unet_checkpoint(self._tensors(_UNET), dict(config)))
+        # names in place of tensors: the converter of a U-Net does nothing but rename
+        theirs = convert_ldm_unet_checkpoint({n: n for n in self.shapes if n.startswith(_UNET)}, dict(config))
+        fill(model, [self.path], {stored: name for name, stored in theirs.items()}.get)
+        return model
 
     def vae(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""

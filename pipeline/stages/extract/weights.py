@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,7 @@ _SCHEDULE = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.0
 _SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
 _TOKENIZER_FILES = ("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
 _STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
+_ATTENTION_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 _PORTION = 1 << 26  # values read before a file is mapped anew
 _BOS, _EOS = 49406, 49407  # of CLIP's vocabulary (Radford et al., ICML 2021)
 
@@ -104,6 +105,7 @@ class DiffusersFolder:
         unet, vae = self._config("unet"), self._config("vae")
         check_unet(unet, self._json("unet"))
         check_class(vae, "AutoencoderKL", self._json("vae"))
+        check_fields(vae, ("block_out_channels",), self._json("vae"))
         check_latents(unet, vae, self._json("unet"))
         scheduler = self.root / "scheduler" / "scheduler_config.json"
         return Architecture(unet, vae, alphas_cumprod(read_json(scheduler) if scheduler.exists() else {}, scheduler))
@@ -167,14 +169,17 @@ class DiffusersFolder:
             if (single := folder / f"{stem}{variant}.safetensors").exists():
                 return [single]
             if index.exists():
-                return [
-                    index,
-                    *sorted({folder / str(name) for name in read_json(index).get("weight_map", {}).values()}),
-                ]
+                return [index, *self._shards(index)]
         pickled = sorted(p.name for p in folder.glob("*") if p.suffix in _PICKLES)
         found = f"only {', '.join(pickled)}" if pickled else "no such file"
         needed = "safetensors: convert it (save_pretrained, safe_serialization=True)" if pickled else "the weights"
         raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
+
+    def _shards(self, index: Path) -> list[Path]:
+        weight_map = read_json(index).get("weight_map")
+        if not isinstance(weight_map, dict) or not weight_map:
+            raise BadInput(index, found=f"weight_map {weight_map!r}", needed="the file of each tensor")
+        return sorted({index.parent / str(name) for name in weight_map.values()})
 
     def _empty(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
         return empty_model(cls, self._config(part), dtype, self._json(part))
@@ -192,9 +197,7 @@ def check_unet(config: Mapping[str, Any], where: Path) -> None:
             raise BadInput(
                 where, found=f"{name} {config[name]!r}", needed="none, as Stable Diffusion 1.x and 2.x have it"
             )
-    for name in ("block_out_channels", "layers_per_block", "cross_attention_dim"):
-        if not config.get(name):
-            raise BadInput(where, found=f"no {name}", needed="the config of a UNet2DConditionModel")
+    check_fields(config, ("block_out_channels", "layers_per_block", "cross_attention_dim"), where)
     for name in ("layers_per_block", "cross_attention_dim"):
         if not isinstance(config[name], int):
             raise BadInput(where, found=f"{name} {config[name]!r}", needed="one whole number")
@@ -206,6 +209,13 @@ def check_class(config: Mapping[str, Any], name: str, where: Path) -> None:
     """Raises BadInput when a config belongs to another class."""
     if config.get("_class_name") != name:
         raise BadInput(where, found=f"_class_name {config.get('_class_name')!r}", needed=name)
+
+
+def check_fields(config: Mapping[str, Any], names: Sequence[str], where: Path) -> None:
+    """Raises BadInput when a config lacks a field."""
+    for name in names:
+        if not config.get(name):
+            raise BadInput(where, found=f"no {name}", needed=f"the config of a {config['_class_name']}")
 
 
 def check_latents(unet: Mapping[str, Any], vae: Mapping[str, Any], where: Path) -> None:
@@ -265,33 +275,30 @@ def empty_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Mod
     return model, getattr(model, "text_model", model)
 
 
-def fill(model: nn.Module, paths: Sequence[Path]) -> None:
+def current_name(name: str) -> str:
+    """A weight's name today: no wrapper around the text encoder; the VAE's attention as since diffusers 0.17."""
+    name = name.removeprefix("text_model.")
+    former = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
+    return former[1] + _ATTENTION_NAMES[former[2]] + former[3] if former else name
+
+
+def fill(model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = current_name) -> None:
     """Weights from safetensors files into a model's own memory. Raises BadInput for ones that do not fit.
 
-    A file stays mapped for some hundred megabytes only: what has been read of it would count as a second copy.
+    ``name_of``: the model's name of a stored tensor. A file stays mapped for some hundred megabytes only: what has been
+    read of it would count as a second copy.
     """
     from safetensors import safe_open
 
     missing = dict(model.named_parameters())
     for path in paths:
-        fitting = {name: current_name(name) for name in tensor_shapes(path)}
-        fitting = {stored: name for stored, name in fitting.items() if name in missing}
-        for stored_names in _portions(fitting, missing):
+        stored = {name: s for s in tensor_shapes(path) if (name := name_of(s)) is not None and name in missing}
+        for names in _portions(stored, missing):
             with safe_open(str(path), framework="pt") as tensors, torch.no_grad():
-                for stored in stored_names:
-                    copy_weight(tensors.get_tensor(stored), missing.pop(fitting[stored]), f"{path}, tensor {stored}")
+                for name in names:
+                    where = f"{path}, tensor {stored[name]}"
+                    copy_weight(tensors.get_tensor(stored[name]), missing.pop(name), where)
     check_missing(sorted(missing), paths[0])
-
-
-def current_name(name: str) -> str:
-    """A weight's name today: no wrapper around the text encoder; the VAE's attention as since diffusers 0.17."""
-    name = name.removeprefix("text_model.")
-    renamed = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
-    if not renamed:
-        return name
-    return (
-        renamed[1] + {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}[renamed[2]] + renamed[3]
-    )
 
 
 def check_missing(names: Sequence[str], where: Path) -> None:
@@ -300,16 +307,16 @@ def check_missing(names: Sequence[str], where: Path) -> None:
         raise BadInput(where, found=f"no tensor for {names[0]} ({len(names)} missing)", needed="all weights")
 
 
-def _portions(names: Mapping[str, str], parameters: Mapping[str, nn.Parameter]) -> Iterator[list[str]]:
-    portion: list[str] = []
+def _portions(names: Iterable[str], parameters: Mapping[str, nn.Parameter]) -> list[list[str]]:
+    portions: list[list[str]] = [[]]
     size = 0
-    for stored, name in names.items():
-        portion.append(stored)
+    for name in names:
+        portions[-1].append(name)
         size += parameters[name].numel()
         if size > _PORTION:
-            yield portion
-            portion, size = [], 0
-    yield portion
+            portions.append([])
+            size = 0
+    return portions
 
 
 def copy_weight(value: Tensor, parameter: nn.Parameter, where: str) -> None:
