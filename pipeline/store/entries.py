@@ -308,7 +308,11 @@ class Entry:
         try:
             if rows is None:
                 return np.asarray(array[...])
-            return np.stack([np.asarray(array[row]) for row in rows])
+            wanted = list(rows)
+            first = wanted[0] if wanted else 0
+            if wanted == list(range(first, first + len(wanted))):  # neighbours are read at once, as batches ask for them
+                return np.asarray(array[first : first + len(wanted)])
+            return np.stack([np.asarray(array[row]) for row in wanted])
         except _UNREADABLE as error:
             raise self.store._damaged(self.ref, f"array {name} does not pass its checksum ({error})") from None
 
