@@ -20,7 +20,13 @@ KILLS = 10
 
 def onboard(cache: Path, scene: Path) -> subprocess.Popen:
     chosen = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"store.root={cache}", "step=onboard")
-    small = ("extract=random_sd", "extract.channels=[8,8,16,16]", "render.count=60", "render.size=96", "runtime.batch=4")
+    small = (
+        "extract=random_sd",
+        "extract.channels=[8,8,16,16]",
+        "render.count=60",
+        "render.size=96",
+        "runtime.batch=4",
+    )
     return subprocess.Popen(
         [sys.executable, "-m", "pipeline", *chosen, *small], cwd=scene.parent, stdout=subprocess.PIPE, text=True
     )

@@ -40,7 +40,9 @@ def disc(size: int) -> torch.Tensor:
 
 
 def toy_pair() -> FusedPair:
-    fused = variant("fuse/concat")(toy_maps(), {k: m.flip(-1) for k, m in toy_maps().items()}, disc(64), disc(64).flip(-1))
+    fused = variant("fuse/concat")(
+        toy_maps(), {k: m.flip(-1) for k, m in toy_maps().items()}, disc(64), disc(64).flip(-1)
+    )
     return fused
 
 
@@ -50,7 +52,9 @@ def toy_crops() -> Crops:
     depth = np.full((128, 128), 500.0, np.float32)
     K = np.array([[200.0, 0, 63.5], [0, 200.0, 63.5], [0, 0, 1]])
     geometry = Geometry([depth], K[None], rigid.rigid(np.eye(3)[None], np.array([[0.0, 0, 500]])))
-    return Crops(rgb * disc(128).numpy()[None, :, :, None].astype(np.uint8), disc(128).numpy()[None], np.eye(3)[None], geometry)
+    return Crops(
+        rgb * disc(128).numpy()[None, :, :, None].astype(np.uint8), disc(128).numpy()[None], np.eye(3)[None], geometry
+    )
 
 
 def toy_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -310,7 +310,9 @@ class Entry:
                 return np.asarray(array[...])
             wanted = list(rows)
             first = wanted[0] if wanted else 0
-            if wanted == list(range(first, first + len(wanted))):  # neighbours are read at once, as batches ask for them
+            if wanted == list(
+                range(first, first + len(wanted))
+            ):  # neighbours are read at once, as batches ask for them
                 return np.asarray(array[first : first + len(wanted)])
             return np.stack([np.asarray(array[row]) for row in wanted])
         except _UNREADABLE as error:
