@@ -38,7 +38,7 @@ def rotation_angle_deg(R_a: Float[np.ndarray, "*n 3 3"], R_b: Float[np.ndarray, 
     D = np.swapaxes(R_a, -1, -2) @ R_b
     cos = (np.trace(D, axis1=-2, axis2=-1) - 1) / 2
     axis = np.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
-    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=-1) / 2, cos))
+    return np.asarray(np.degrees(np.arctan2(np.linalg.norm(axis, axis=-1) / 2, cos)))
 
 
 def look_at(eye: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4 4"]:

@@ -28,7 +28,7 @@ class Node:
 
 @dataclass(eq=False)
 class Plan:
-    """Lists nodes. Detections are read from their files, since all that follows depends on them; nothing is stored."""
+    """Lists nodes. Detections alone are made, since the keys of all that follows depend on them."""
 
     run: Context
     templates: TemplateNodes

@@ -7,8 +7,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from pipeline.errors import BadInput
-from pipeline.store.entries import DamagedEntry, Store, _completeness
+from pipeline.store.entries import DamagedEntry, Store
 from pipeline.store.keys import Ref, make_ref
+from pipeline.store.seal import completeness
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ def entries(store: Store) -> list[Row]:
 
 def _row(store: Store, path: str) -> Row:
     attributes = store.attributes(path) or {}
-    record = _completeness(attributes, path.rsplit("/", 1)[-1])
+    record = completeness(attributes, path.rsplit("/", 1)[-1])
     made_from = attributes.get("made_from")
     age = None
     if record is not None:

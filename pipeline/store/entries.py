@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cached_property, partial
 from typing import Any
 
@@ -25,11 +24,11 @@ from zarr.core.sync import sync
 from zarr.errors import BaseZarrError
 
 from pipeline.errors import DzopError
-from pipeline.spec import canonical, digest
+from pipeline.spec import canonical
 from pipeline.store.backends import Backend, StoreConfig
 from pipeline.store.keys import Ref
+from pipeline.store.seal import FORMAT, completeness, finish, metadata_digest
 
-FORMAT = 1
 _WRITE_ZEROS: Any = {"write_empty_chunks": True}
 _UNREADABLE = (BaseZarrError, ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError, IsADirectoryError)
 
@@ -81,7 +80,7 @@ class Store:
     def complete(self, ref: Ref) -> bool:
         """Whether the entry is whole as far as its own records say; array bytes are checked when read."""
         group = self._group(ref.path)
-        return group is not None and _completeness(dict(group.attrs), ref.key) is not None
+        return group is not None and completeness(dict(group.attrs), ref.key) is not None
 
     def state(self, ref: Ref) -> str:
         """``cached``, ``partial`` or ``missing``."""
@@ -92,7 +91,7 @@ class Store:
     def size(self, ref: Ref) -> int | None:
         """Bytes of a complete entry's arrays, uncompressed; None when it is not complete."""
         group = self._group(ref.path)
-        record = None if group is None else _completeness(dict(group.attrs), ref.key)
+        record = None if group is None else completeness(dict(group.attrs), ref.key)
         return None if record is None else int(record["bytes"])
 
     # --- reading ---------------------------------------------------------------------------------------------------
@@ -100,7 +99,7 @@ class Store:
     def read(self, ref: Ref) -> Entry:
         """A complete entry. Raises DamagedEntry when it is missing or not whole."""
         group = self._group(ref.path)
-        record = None if group is None else _completeness(dict(group.attrs), ref.key)
+        record = None if group is None else completeness(dict(group.attrs), ref.key)
         if group is None or record is None:
             raise self._damaged(ref, "it is not complete")
         return Entry(self, ref, group, record)
@@ -122,7 +121,7 @@ class Store:
         """A whole entry without arrays: one JSON document, written at once."""
         with self._exclusive([ref]):
             group = self._fresh(ref)
-            _finish(group, ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
+            finish(group, ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
 
     def fill(
         self,
@@ -159,7 +158,7 @@ class Store:
                 group = self._group(ref.path)
                 if group is None:
                     raise self._damaged(ref, "it was removed while it was written")
-                _finish(group, ref, arrays[ref], dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
+                finish(group, ref, arrays[ref], dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
         return Filled(computed, rows - computed, seconds)
 
     def _announce_for(self, ref: Ref, text: str) -> None:
@@ -322,7 +321,7 @@ class Entry:
         if name in self._checked:
             return self._checked[name]
         array = Store._array(self.group, name)
-        if array is None or _metadata_digest(array) != self.record["arrays"].get(name):
+        if array is None or metadata_digest(array) != self.record["arrays"].get(name):
             raise self.store._damaged(self.ref, f"array {name} has other metadata than when it was completed")
         missing = array.shape[0] - len(self.store.chunks_present(array))
         if missing:
@@ -358,57 +357,6 @@ def _readable(array: zarr.Array, row: int) -> bool:
     except _UNREADABLE:
         return False
     return True
-
-
-def _metadata_digest(array: zarr.Array) -> str:
-    return digest(json.loads(json.dumps(array.metadata.to_dict(), default=str)))
-
-
-def _finish(
-    group: zarr.Group,
-    ref: Ref,
-    arrays: Mapping[str, zarr.Array],
-    document: Any,
-    *,
-    rows: int,
-    time_s: float,
-    nbytes: int,
-) -> None:
-    """The one write that makes an entry count: document and completeness, in one atomic replacement."""
-    record = {
-        "rows": rows,
-        "bytes": nbytes,
-        "time_s": round(time_s, 4),
-        "at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "arrays": {name: _metadata_digest(array) for name, array in arrays.items()},
-        "document": digest(document),
-    }
-    attributes = {
-        "document": document,
-        "complete": record | {"seal": _seal(ref.key, json.loads(ref.made_from), record)},
-    }
-    group.attrs.update(attributes)
-
-
-def _seal(key: str, made_from: Any, record: Mapping[str, Any]) -> str:
-    return digest([FORMAT, key, made_from, dict(record)])
-
-
-def _completeness(attributes: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
-    """The record of completeness, None unless every part of it holds together."""
-    try:
-        record = dict(attributes["complete"])
-        seal = record.pop("seal")
-        whole = (
-            attributes["key"] == key
-            and attributes["format"] == FORMAT
-            and seal == _seal(key, attributes["made_from"], record)
-            and digest(attributes["document"]) == record["document"]
-            and digest(attributes["made_from"]) == key
-        )
-    except (KeyError, TypeError, ValueError, AttributeError):
-        return None
-    return record if whole else None
 
 
 def _entry_of(key: str) -> str | None:
