@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pipeline.cache_cli import cache_command
 from pipeline.errors import BadInput, DzopError
@@ -28,16 +28,20 @@ from pipeline.store import Store
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "detect")
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
+_failed_jobs: list[str] = []
 
 
 def main() -> None:
     """Run, and turn whatever a user can mend into one line on stderr and exit status 1."""
+    _failed_jobs.clear()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing a paragraph; the line below is the message
     try:
         if sys.argv[1:2] == ["cache"]:
             cache_command(sys.argv[2:])
         else:
             _hydra_main()
+            if _failed_jobs:
+                sys.exit(f"error: {len(_failed_jobs)} of the sweep's jobs failed: {'; '.join(_failed_jobs)}")
     except (DzopError, HydraException, OmegaConfBaseException) as error:
         sys.exit(_told(error))
     except BrokenPipeError:
@@ -51,10 +55,19 @@ def main() -> None:
 def _hydra_main(config: DictConfig) -> None:
     try:
         _job(config)
+    except MissingMandatoryValue as error:
+        _give_up(BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
     except DzopError as error:
-        if HydraConfig.get().mode is RunMode.RUN:
-            sys.exit(_told(error))
-        raise  # Hydra names the overrides of the sweep's failed job, after the others have run
+        _give_up(error)
+
+
+def _give_up(error: DzopError) -> None:
+    """End with the error; in a sweep go on, and end with the errors of all its jobs."""
+    told = _told(error)
+    if HydraConfig.get().mode is RunMode.RUN:
+        sys.exit(told)
+    print(told, file=sys.stderr, flush=True)
+    _failed_jobs.append(f"{' '.join(HydraConfig.get().overrides.task)} ({told.removeprefix('error: ')})")
 
 
 def _job(config: DictConfig) -> None:

@@ -24,7 +24,7 @@ def cache_command(arguments: list[str]) -> None:
     commands.add_parser("du", parents=[place], help="bytes by folder")
     commands.add_parser("verify", parents=[place], help="read and check every byte; damaged entries become incomplete")
     gc = commands.add_parser("gc", parents=[place], help="remove incomplete entries, and old ones if asked")
-    gc.add_argument("--older-than", type=float, metavar="DAYS", help="also complete entries older than this")
+    gc.add_argument("--older-than", type=_days, metavar="DAYS", help="also complete entries older than this")
     gc.add_argument("--dry-run", action="store_true", help="only say what would go")
     path = commands.add_parser("path", parents=[place], help="where an entry lies and what it was made from")
     path.add_argument("key", help="the first digits of its key")
@@ -44,11 +44,20 @@ def cache_command(arguments: list[str]) -> None:
         print(json.dumps(row.made_from, indent=2, sort_keys=True))
 
 
+def _days(text: str) -> float:
+    days = float(text)
+    if not days >= 0:
+        raise argparse.ArgumentTypeError(f"found {text}, needs a number of days >= 0")
+    return days
+
+
 def _open(root: str) -> Store:
     if root.startswith("s3://"):
         return Store(S3StoreConfig(url=root), announce=print)
     if not Path(root).is_dir():
         raise DzopError(f"{root}: found no such folder, needs a store (--root)")
+    if not (Path(root) / ".locks").is_dir() and any(p.name != ".gitkeep" for p in Path(root).iterdir()):
+        raise DzopError(f"{root}: found a folder that is no store, needs one that a run has written (--root)")
     return Store(LocalStoreConfig(root=root), announce=print)
 
 

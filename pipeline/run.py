@@ -162,7 +162,9 @@ def _estimate(graph: Graph, options: Options) -> None:
     print(f"\n{len(estimates)} poses, {len(missing)} without (each with its reason)")
     print(f"csv       {folder / csv}\nrecords   {folder / 'poses.json'}")
     if options.overlays:
-        print(f"overlays  {folder / 'overlays'}  (ground truth blue; green: MSSD < {CORRECT_MSSD:.0%} of the diameter)")
+        compared = any(c.judged for c in checked)
+        meaning = f"ground truth blue; green: MSSD < {CORRECT_MSSD:.0%} of the diameter" if compared else "estimates"
+        print(f"overlays  {folder / 'overlays'}  ({meaning})")
 
 
 def _judged(graph: Graph, answer: Answer) -> Judged | None:

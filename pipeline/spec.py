@@ -14,6 +14,7 @@ A variant of a stage is a frozen, type-checked dataclass whose fields are its pa
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from hashlib import sha256
@@ -130,6 +131,8 @@ class Runtime:
         """Torch's name of the device. Raises BadInput when CUDA is asked for and absent."""
         import torch
 
+        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
+            raise BadInput("runtime.device", found=repr(self.device), needed="auto, cpu, cuda or cuda:N")
         if self.device == "auto":
             return "cuda" if torch.cuda.is_available() else "cpu"
         if self.device.startswith("cuda") and not torch.cuda.is_available():

@@ -8,6 +8,7 @@ import pytest
 from command import Ran, run_dzop
 from PIL import Image
 
+from pipeline.bop.images import read_mask
 from pipeline.bop.results import read_results
 from pipeline.synthetic.scenes import write_dataset
 
@@ -174,8 +175,10 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
         (("+cluster.size=3",), "cluster.size: found an unknown field, needs one of: count"),
         (("match=nearest",), "Could not find 'match/nearest' Available options in 'match': cosine masked_cosine"),
         (("match.top_k=0",), "match.top_k: found 0, needs greater than or equal to 1"),
-        (("fuse.layers=[2,12]",), "12"),
-        (("match.layer=7",), "7"),
+        (("fuse.layers=[2,12]",), "fuse.layers: found 12, needs one of 2, 5, 8, 11"),
+        (("match.layer=7",), "match.layer: found 7, needs one of 2, 5, 8, 11"),
+        (("runtime.device=gpu",), "runtime.device: found 'gpu', needs auto, cpu, cuda or cuda:N"),
+        (("dataset.name=???",), "dataset.name: found nothing, needs a value"),
         (("select.objects=[9]",), "select.objects: found [9], needs some of the targets' objects: 1, 2"),
         (("step=cook",), "step: found 'cook', needs 'all', 'onboard', 'detect' or 'estimate'"),
         (("detect=json",), "detect.path"),
@@ -195,6 +198,37 @@ def test_a_mistake_is_told_in_one_line(dzop, tmp_path, arguments, told):
     assert lines[0].startswith("error: ")
     assert told in lines[0]
     assert not list(tmp_path.glob("cache/*/*/zarr.json"))
+
+
+@pytest.mark.parametrize("drawn_in", ["colour", "alpha", "palette"])
+def test_a_mask_with_an_alpha_channel_or_a_palette_is_the_same_mask(tmp_path, scene, monkeypatch, drawn_in):
+    monkeypatch.chdir(tmp_path)
+    plain = Image.open(scene / "test" / "000001" / "mask_visib" / "000000_000000.png").convert("L")
+    white, opaque = Image.new("L", plain.size, 255), Image.new("L", plain.size, 255)
+    if drawn_in == "palette":
+        plain.convert("RGB").convert("P").save("mask.png")
+    else:
+        channels = (plain, plain, plain, opaque) if drawn_in == "colour" else (white, white, white, plain)
+        Image.merge("RGBA", channels).save("mask.png")
+    np.testing.assert_array_equal(read_mask(Path("mask.png")), np.asarray(plain) > 0)
+
+
+def test_the_reason_of_a_refused_detection_is_that_of_this_file(dzop, tmp_path, cache):
+    entry = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "time": 0.1}
+    for name, bbox in (("short", [1, 2, 3]), ("flat", [1, 2, 0, 3])):
+        Path("found.json").write_text(json.dumps([{**entry, "bbox": bbox}]))
+        dzop(f"store.root={cache}", "detect=json", "detect.path=found.json", "select.objects=[1]", f"out={name}")
+        answers = json.loads(next(tmp_path.glob(f"{name}/*/*/poses.json")).read_text())["answers"]
+        assert str(bbox) in answers[0]["reason"]
+
+
+def test_a_sweep_goes_on_after_a_job_that_fails_and_names_it_at_the_end(dzop, cache):
+    ran = dzop("-m", f"store.root={cache}", "cluster.count=4,0,6")
+    assert ran.status == 1
+    assert len(ran.counts()) == 2
+    last = ran.err.splitlines()[-1]
+    assert last.startswith("error: 1 of the sweep's jobs failed: ")
+    assert "cluster.count=0" in last
 
 
 def test_a_photograph_of_another_size_than_its_mask_is_told(dzop, tmp_path, scene, capsys, monkeypatch):
@@ -240,6 +274,30 @@ def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
         json.loads((results(tmp_path) / "poses.json").read_text())["config"]["match"]["_target_"]
         == "elsewhere.first.First"
     )
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (("dataset.K=[1,2]",), "dataset.K: found 2 numbers, needs [fx,fy,cx,cy]"),
+        (("dataset.K=[nan,300,160,120]",), "nan"),
+        (("dataset.K=[3000,3000,1600,1200]",), "dataset.K"),
+        (("dataset.bbox=[100,80,nan,60]",), "dataset.bbox: found [100.0, 80.0, nan, 60.0], needs four finite numbers"),
+        (("dataset.bbox=[900,80,60,60]",), "dataset.bbox: found [900.0, 80.0, 60.0, 60.0]"),
+        (("dataset.mesh=nowhere.ply",), "nowhere.ply: found no such file"),
+        (("dataset.scale=0.001",), "it looks like metres"),
+        (("dataset.mask=both.png",), "dataset: found both of mask and bbox"),
+    ],
+)
+def test_a_mistake_in_ones_own_data_is_told_in_one_line(tmp_path, scene, capsys, monkeypatch, given, told):
+    monkeypatch.chdir(tmp_path)
+    frame = scene / "test" / "000001" / "rgb" / "000000.png"
+    good = (f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={frame}", "dataset.bbox=[100,80,60,60]")
+    camera = () if given[0].startswith("dataset.K") else ("dataset.K=[[300,0,160],[0,300,120],[0,0,1]]",)
+    ran = run_dzop(capsys, monkeypatch, "dataset=photo", *SMALL, *good, *camera, *given)
+    assert ran.status == 1
+    assert len(ran.err.splitlines()) == 1
+    assert told in ran.err
 
 
 def test_cache_commands_list_measure_verify_and_clean(dzop):

@@ -21,10 +21,15 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """True where the file is not black."""
+    """True where the file is not black; a mask drawn in the alpha channel alone counts too."""
     with _open(path) as image:
-        values = np.asarray(image)
-    return np.asarray(values.reshape(*values.shape[:2], -1).any(axis=-1))
+        values = np.asarray(image.convert("RGBA") if image.mode in ("P", "PA", "LA", "RGBA") else image)
+    values = values.reshape(*values.shape[:2], -1)
+    if values.shape[-1] != 4:
+        return np.asarray(values.any(axis=-1))
+    colour, alpha = values[..., :3].any(axis=-1), values[..., 3] > 0
+    drawn_in_alpha = not alpha.all() and (colour.all() or not colour.any())
+    return np.asarray(alpha if drawn_in_alpha else colour & alpha)
 
 
 def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:

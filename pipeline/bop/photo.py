@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.images import image_size, read_rgb
+from pipeline.bop.jsonio import is_number
 from pipeline.bop.scene import Box, check_K, edges
 from pipeline.errors import BadInput
 from pipeline.items.objects import ObjectModel
@@ -34,7 +35,7 @@ class PhotoConfig(Spec):
 
     mesh: str
     image: str
-    K: tuple[float, ...]
+    K: tuple[Any, ...]
     mask: str | None = None
     bbox: tuple[float, float, float, float] | None = None
     scale: PositiveFloat = 1.0
@@ -46,11 +47,14 @@ class PhotoConfig(Spec):
         size_hw = image_size(image)
         K = self._matrix()
         check_K(K, size_hw, "dataset.K")
+        _check_principal_point(K, size_hw)
         if (self.mask is None) == (self.bbox is None):
             found = "neither" if self.mask is None else "both"
             raise BadInput(
                 "dataset", found=f"{found} of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
             )
+        if self.bbox is not None and not np.isfinite(self.bbox).all():
+            raise BadInput("dataset.bbox", found=list(self.bbox), needed="four finite numbers: x, y, width, height")
         return Photo(
             name=self.name,
             root=image.parent,
@@ -67,14 +71,25 @@ class PhotoConfig(Spec):
         )
 
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
-        if len(self.K) == 4:
-            fx, fy, cx, cy = self.K
+        flat = [value for row in self.K for value in (row if isinstance(row, tuple) else (row,))]
+        if not all(is_number(value) for value in flat):
+            raise BadInput("dataset.K", found=list(self.K), needed="numbers: [fx,fy,cx,cy] or the matrix, row by row")
+        if len(flat) == 4:
+            fx, fy, cx, cy = flat
             return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        if len(self.K) == 9:
-            return np.array(self.K, float).reshape(3, 3)
+        if len(flat) == 9:
+            return np.array(flat, float).reshape(3, 3)
         raise BadInput(
-            "dataset.K", found=f"{len(self.K)} numbers", needed="[fx,fy,cx,cy] or the 9 of the matrix, row by row"
+            "dataset.K", found=f"{len(flat)} numbers", needed="[fx,fy,cx,cy] or the 9 of the matrix, row by row"
         )
+
+
+def _check_principal_point(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> None:
+    """Without annotations, only a principal point far outside tells the K of another image."""
+    (h, w), (cx, cy) = size_hw, K[:2, 2]
+    if not (-w <= cx <= 2 * w and -h <= cy <= 2 * h):
+        found = f"principal point ({cx:g}, {cy:g}) for an image of {w} x {h} (width x height)"
+        raise BadInput("dataset.K", found=found, needed="the K of this image at this size")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ template features, query features, stages -> poses (by scene and object) -> run 
 
 from __future__ import annotations
 
+from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
@@ -29,9 +30,17 @@ class Graph:
         self.poses = PoseNodes(run, self.templates, self.queries)
 
     def check(self) -> None:
-        """Raise BadInput for a layer the extractor does not have, or weights that are not there, before any work."""
-        for layer in self.run.stages.layers:
-            self.run.stages.extract.feature_shape(layer)
+        """Raise BadInput for a device, weights or a layer that are not there, before any work."""
+        self.run.runtime.torch_device()
+        stages = self.run.stages
+        for where, layers in (("match.layer", (stages.match.layer,)), ("fuse.layers", stages.fuse.layers)):
+            for layer in layers:
+                try:
+                    stages.extract.feature_shape(layer)
+                except BadInput as fault:
+                    if "layer" in fault.where:
+                        raise BadInput(where, found=fault.found, needed=fault.needed) from None
+                    raise
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""

@@ -52,8 +52,7 @@ class PoseNodes:
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.run.K(image).tolist()]
-            # why a detection is defective may name a place on this disk; that it is, is what counts
-            asked += [detection_record(d) | {"defect": d.defect is not None} for _, d in self._detections(target)]
+            asked += [detection_record(d) for _, d in self._detections(target)]
             features = [self.queries.features(image, layer).key for layer in stages.layers]
             inputs[f"image {target.im_id}"] = digest([asked, self.queries.crops(image).key, features])
         return make_ref("poses", recipe, inputs)

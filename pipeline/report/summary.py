@@ -34,6 +34,9 @@ def answers_table(rows: Sequence[Checked]) -> str:
         notes = "; ".join([*answer.notes, *([f"fallback: {answer.fallback}"] if answer.fallback else [])])
         inliers = f"{answer.inliers}/{answer.correspondences}"
         lines.append(f"{head}{errors}{inliers:>9}{reprojection:>9}{seconds:>6.2f} s  {notes}")
+        if judged is None:
+            R, t = answer.T_cam_obj[:3, :3].round(4).tolist(), answer.T_cam_obj[:3, 3].round(1).tolist()
+            lines.append(f"       t {t} mm, R {R} (object to camera)")
     return "\n".join(lines)
 
 

@@ -6,6 +6,7 @@ caster's. Depth comes from a pass without multisampling, which alone has its sam
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -153,6 +154,7 @@ def _two_sided(gl: Any, **textures: Any) -> Any:
 def _canvas(mesh: Mesh, crease_deg: float) -> Iterator[_Canvas]:
     """A canvas whose context is freed at the end. Raises BadInput where OpenGL cannot be had."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # it announces its missing accelerator to every log
     try:
         import pyrender as gl
 
