@@ -36,7 +36,8 @@ def file_digest(path: Path) -> str:
             while block := stream.read(1 << 22):
                 hasher.update(block)
     except (OSError, ValueError) as error:
-        raise BadInput(path, found=error, needed="a readable file") from None
+        found = error.strerror if isinstance(error, OSError) else error
+        raise BadInput(path, found=found, needed="a readable file") from None
     if memo is not None:
         _write(memo, {"path": str(path.resolve()), "sha256": hasher.hexdigest()})
     return hasher.hexdigest()
