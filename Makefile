@@ -41,7 +41,7 @@ demo: $(STAMP) ## poses of procedural objects in cluttered scenes, with errors a
 	$(PY) -m pipeline dataset=demo $(ARGS)
 
 test: $(STAMP) gl ## the whole test suite
-	PYOPENGL_PLATFORM=egl $(PY) -m pytest $(ARGS)
+	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-fast: $(STAMP) ## the tests that take less than 20 seconds each
 	$(PY) -m pytest -m "not slow" $(ARGS)

@@ -41,11 +41,12 @@ def test_every_target_has_a_pose_or_a_reason(bop_mini, capsys, monkeypatch, tmp_
 
 
 @pytest.mark.slow
-def test_hog_finds_most_unoccluded_objects_near_where_they_are(bop_mini, capsys, monkeypatch, tmp_path):
+def test_hog_with_the_papers_views_finds_an_object_near_where_it_is(bop_mini, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    chosen = ("select.images=[3,438,1012]", "select.objects=[5,9]", "overlays=false", "render.count=100")
-    run_dzop(capsys, monkeypatch, "dataset=lmo", f"dataset.root={bop_mini / 'lmo'}", *QUICK, *chosen)
+    chosen = ("extract=hog", "select.objects=[5]", "overlays=false", "render.size=128", "runtime.progress=false")
+    run_dzop(capsys, monkeypatch, "dataset=lmo", f"dataset.root={bop_mini / 'lmo'}", *chosen)
     record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
     relative = [a["errors"]["mssd_mm"] / a["errors"]["diameter_mm"] for a in record["answers"] if a.get("errors")]
-    # on all 285 targets with 301 templates the median is 0.32 of the diameter; a broken convention gives 1 and more
-    assert np.median(relative) < 0.6
+    assert len(relative) >= 38
+    # at 256 px a median of 0.14 of the diameter was measured; a broken convention gives 1 and more
+    assert np.median(relative) < 0.3
