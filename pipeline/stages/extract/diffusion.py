@@ -6,6 +6,7 @@ latent once, run the U-Net once, read its decoder.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -57,7 +58,7 @@ class LoadedModel:
 
 
 @spec
-class DiffusionFeatures(Spec):
+class DiffusionFeatures(Spec, ABC):
     """The parameters that all latent diffusion extractors share.
 
     ``hook`` picks one of three readings of "layer k", see ``decoder.tapped_module``. ``noise`` "none" passes the clean
@@ -76,13 +77,13 @@ class DiffusionFeatures(Spec):
     ensemble: Positive = 1
     dtype: Dtype = "float32"
 
+    @abstractmethod
     def architecture(self) -> Architecture:
         """Configs alone; no weights are loaded."""
-        raise NotImplementedError
 
+    @abstractmethod
     def load_model(self) -> LoadedModel:
         """Weights into memory."""
-        raise NotImplementedError
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe; without noise, neither its seed nor the size of its ensemble can matter."""
