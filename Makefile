@@ -9,7 +9,13 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo test test-fast lint clean
+.PHONY: help setup gl demo ablations sweeps ladder report test test-fast lint clean
+
+PAPER := correspondence clusters pca_dim per_cluster timesteps theta
+OURS  := hook input_size template_layer layers noise viewpoints top_k solver
+# each sweep in turn; one that fails lets the others run, and fails the target at the end
+sweep  = failed=; for name in $(1); do echo "== sweep=$$name"; $(PY) -m pipeline dataset=demo sweep=$$name $(ARGS) || failed="$$failed $$name"; done; \
+	[ -z "$$failed" ] || { echo "sweeps with failed jobs:$$failed" >&2; exit 1; }
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -37,8 +43,22 @@ gl: ## EGL for render=pyrender (render=raycast needs no system package)
 		echo "[setup] no EGL: pyrender's tests are skipped. To have them: sudo apt-get install libegl1 libgl1-mesa-dri"; \
 	fi
 
-demo: $(STAMP) ## poses of procedural objects in cluttered scenes, with errors against the exact ground truth
+demo: $(STAMP) ## poses of procedural objects in cluttered scenes, errors against the exact ground truth, one page
 	$(PY) -m pipeline dataset=demo $(ARGS)
+	$(PY) -m pipeline dataset=demo step=report $(ARGS)
+
+ablations: $(STAMP) ## the paper's ablations on the demo data; ARGS="dataset=lmo dataset.root=..." for others
+	$(PY) -m pipeline dataset=demo $(ARGS)
+	@$(call sweep,$(PAPER))
+
+sweeps: $(STAMP) ## what the paper did not ablate, on the demo data
+	@$(call sweep,$(OURS))
+
+ladder: $(STAMP) ## the oracle ladder on the demo data: true mask, true template, true correspondences
+	@$(call sweep,ladder)
+
+report: $(STAMP) ## one page of all runs below results/: results/report/index.html
+	$(PY) -m pipeline step=report $(ARGS)
 
 test: $(STAMP) gl ## the whole test suite
 	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile $(ARGS)

@@ -1,14 +1,17 @@
 """The command line: configuration -> a run. The only module that knows Hydra.
 
-``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache ...`` looks after the store.
+``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache ...`` looks after the store; ``dzop score ...``
+and ``dzop lint ...`` take results files.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import hydra
@@ -21,27 +24,32 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pipeline.cache_cli import cache_command
 from pipeline.errors import BadInput, DzopError
 from pipeline.route import Stages
-from pipeline.run import Options, Select, run
+from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
+from pipeline.score_cli import lint_command, score_command
 from pipeline.spec import Runtime, build
 from pipeline.store import Store
 
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "detect")
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
-_failed_jobs: list[str] = []
+COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
+FAILED = "DZOP_FAILED_JOBS"
+"""Environment variable: folder where a sweep's jobs, in whatever process a launcher runs them, leave their errors."""
 
 
 def main() -> None:
     """Run, and turn whatever a user can mend into one line on stderr and exit status 1."""
-    _failed_jobs.clear()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing a paragraph; the line below is the message
     try:
-        if sys.argv[1:2] == ["cache"]:
-            cache_command(sys.argv[2:])
-        else:
+        if sys.argv[1:2] and sys.argv[1] in COMMANDS:
+            COMMANDS[sys.argv[1]](sys.argv[2:])
+            return
+        with TemporaryDirectory(prefix="dzop-") as folder:
+            os.environ[FAILED] = folder
             _hydra_main()
-            if _failed_jobs:
-                sys.exit(f"error: {len(_failed_jobs)} of the sweep's jobs failed: {'; '.join(_failed_jobs)}")
+            failed = [path.read_text() for path in sorted(Path(folder).iterdir())]
+        if failed:
+            sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {'; '.join(failed)}")
     except (DzopError, HydraException, OmegaConfBaseException) as error:
         sys.exit(_told(error))
     except BrokenPipeError:
@@ -53,32 +61,46 @@ def main() -> None:
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
 def _hydra_main(config: DictConfig) -> None:
+    sweeping = HydraConfig.get().mode is RunMode.MULTIRUN
     try:
-        _job(config)
+        _job(config, sweeping=sweeping)
     except MissingMandatoryValue as error:
-        _give_up(BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
+        _give_up(config, BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
     except DzopError as error:
-        _give_up(error)
+        _give_up(config, error)
+    except Exception as error:
+        if not sweeping:
+            raise
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        _give_up(config, DzopError(f"{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"))
 
 
-def _give_up(error: DzopError) -> None:
-    """End with the error; in a sweep go on, and end with the errors of all its jobs."""
+def _give_up(config: DictConfig, error: DzopError) -> None:
+    """End with the error; a sweep's job leaves it for the end and for reports, and the sweep goes on."""
     told = _told(error)
     if HydraConfig.get().mode is RunMode.RUN:
         sys.exit(told)
     print(told, file=sys.stderr, flush=True)
-    _failed_jobs.append(f"{' '.join(HydraConfig.get().overrides.task)} ({told.removeprefix('error: ')})")
+    overrides = list(HydraConfig.get().overrides.task)
+    message = told.removeprefix("error: ")
+    number = int(HydraConfig.get().job.num)
+    (Path(os.environ[FAILED]) / f"{number:06d}").write_text(f"{' '.join(overrides)} ({message})")
+    values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    note_failure(values["out"], values, overrides, message)
 
 
-def _job(config: DictConfig) -> None:
+def _job(config: DictConfig, *, sweeping: bool) -> None:
     # one plain dict, so that nothing below knows OmegaConf
     values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    if values["step"] == "report":
+        make_report(values["out"])
+        return
     run(
         stages=stages_of(values),
         dataset=variant(values["dataset"], "dataset"),
         store=Store(variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),
         runtime=build(Runtime, values["runtime"], where="runtime"),
-        options=options_of(values),
+        options=options_of(values, resume=sweeping),
     )
 
 
@@ -90,16 +112,18 @@ def stages_of(values: Mapping[str, Any]) -> Stages:
     return Stages(**chosen, fallback=values["fallback"])
 
 
-def options_of(values: Mapping[str, Any]) -> Options:
+def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:
     """What to run and where to write, from a configuration."""
-    names = ("step", "plan", "out", "overlays", "threads", "method")
-    select = build(Select, values["select"], where="select")
-    label = {stage: values[stage]["_target_"].rsplit(".", 2)[-2] for stage in STAGES}
-    return build(
-        Options,
-        {**{name: values[name] for name in names}, "select": select, "config": values, "label": label},
-        where="config",
-    )
+    names = ("step", "plan", "out", "overlays", "gallery", "threads", "method")
+    made = {
+        "sweep": values.get("sweep"),
+        "select": build(Select, values["select"], where="select"),
+        "evaluate": build(Evaluate, values["evaluate"], where="evaluate"),
+        "label": {stage: values[stage]["_target_"].rsplit(".", 2)[-2] for stage in STAGES},
+        "config": values,
+        "resume": resume,
+    }
+    return build(Options, {**{name: values[name] for name in names}, **made}, where="config")
 
 
 def variant(values: Mapping[str, Any], where: str) -> Any:

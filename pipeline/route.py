@@ -20,17 +20,18 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional import camera, rigid
+from pipeline.functional.masks import foreground
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
 from pipeline.stages.cluster import Clusterer
-from pipeline.stages.correspond import Corresponder
+from pipeline.stages.correspond import Corresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import Detector
 from pipeline.stages.extract import Extractor
 from pipeline.stages.fuse import Fuser
 from pipeline.stages.lift import lift
-from pipeline.stages.match import Matcher
+from pipeline.stages.match import Matcher, TruthMatcher
 from pipeline.stages.render import Renderer
 from pipeline.stages.solve import Solver
 
@@ -53,19 +54,35 @@ class Stages:
     fallback: bool = False
 
     @property
+    def need_truth(self) -> str:
+        """The oracle among the online stages that must be shown the true pose, "" when none is."""
+        if isinstance(self.match, TruthMatcher):
+            return "match=oracle"
+        return "correspond=oracle" if isinstance(self.correspond, TruthCorresponder) else ""
+
+    @property
     def layers(self) -> tuple[int, ...]:
         """Decoder layers the route reads: the template layer and the hyperfeature layers."""
         return tuple(sorted({self.match.layer, *self.fuse.layers}))
 
 
 @dataclass(frozen=True, eq=False)
+class Truth:
+    """What no method may see: the true pose, and the object's symmetries."""
+
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    symmetries: Float[np.ndarray, "s 4 4"]
+
+
+@dataclass(frozen=True, eq=False)
 class Query:
-    """One detection: features by layer, its crop, and its camera."""
+    """One detection: features by layer, its crop, and its camera. ``truth``: None but for an oracle that needs it."""
 
     features: Mapping[int, Float[Tensor, "c h w"]]
     mask: Bool[Tensor, "S S"]
     A_crop_img: Float[np.ndarray, "3 3"]
     K: Float[np.ndarray, "3 3"]
+    truth: Truth | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +98,15 @@ class TemplateView:
 
 
 class TemplateBank(Protocol):
-    """An object's templates: features of the match layer and crop masks of all of them, any view in full."""
+    """An object's templates: features of the match layer, crop masks and poses of all of them, any view in full."""
 
     features: Float[Tensor, "n c h w"]
     mask: Bool[Tensor, "n S S"]
+
+    @property
+    def T_cam_obj(self) -> Float[np.ndarray, "n 4 4"]:
+        """Poses of all templates."""
+        ...
 
     def view(self, index: int) -> TemplateView:
         """Everything about one template."""
@@ -151,11 +173,17 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     """The online route. Raises NoPose when no template can be compared; one that leads nowhere keeps its reason."""
     clock = Clock()
     with clock("match"):
-        match = stages.match(query.features[stages.match.layer], query.mask, bank.features, bank.mask)
+        match = _match(stages, query, bank)
     ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
     hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
     hypotheses.sort(key=lambda h: -h.inliers)  # stable: equals stay in the order of their templates
     return Trace(match, tuple(hypotheses), clock.times_s)
+
+
+def _match(stages: Stages, query: Query, bank: TemplateBank) -> TemplateMatch:
+    if isinstance(stages.match, TruthMatcher) and query.truth is not None:
+        return stages.match.by_truth(query.truth.T_cam_obj, query.truth.symmetries, bank.T_cam_obj)
+    return stages.match(query.features[stages.match.layer], query.mask, bank.features, bank.mask)
 
 
 def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, score: float, clock: Clock) -> Hypothesis:
@@ -170,7 +198,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
             clusters = stages.cluster(pair)
             parts["clusters"] = clusters
         with clock("correspond"):
-            matches = stages.correspond(pair, clusters, crop_size=stages.crop.size)
+            matches = _matched(stages, query, template, pair, clusters)
             parts["matches"] = matches
         with clock("lift"):
             points_obj, query_px_img = _lifted(matches, query, template)
@@ -186,6 +214,22 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
+
+
+def _matched(
+    stages: Stages, query: Query, template: TemplateView, pair: FusedPair, clusters: Clusters
+) -> Correspondences:
+    """Corresponding points; the true ones for an oracle."""
+    if not isinstance(stages.correspond, TruthCorresponder) or query.truth is None:
+        return stages.correspond(pair, clusters, crop_size=stages.crop.size)
+    cells = pair.template_mask.shape[-1]
+    cell_xy = camera.grid_xy(foreground(pair.template_mask), width=cells)
+    template_px = camera.cell_to_px(cell_xy.double(), size=stages.crop.size, cells=cells)
+    px = template_px.cpu().numpy()
+    points_obj = lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
+    true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
+    true_px = torch.from_numpy(camera.apply(query.A_crop_img, true_px_img)).to(template_px.device)
+    return stages.correspond.by_truth(template_px, true_px, query.mask)
 
 
 def _lifted(

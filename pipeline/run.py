@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-import json
-import os
 import time
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import cv2
 import torch
+from pydantic import Field
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.results import results_name, rows_of, write_results
 from pipeline.digests import remember_in
 from pipeline.errors import BadInput
-from pipeline.graph import Context, Graph, Node
-from pipeline.items.poses import NoEstimate, PoseEstimate
-from pipeline.items.records import Answer, record_of
+from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes
+from pipeline.items.poses import NoEstimate
+from pipeline.items.records import Answer
+from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Target
-from pipeline.metrics.judge import CORRECT_MSSD, Judged, judge
-from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
+from pipeline.outputs import KEY_DIGITS, Outputs, now
+from pipeline.report.rows import Case, Row, read_row, read_rows, row_id, row_path, write_row
+from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
 from pipeline.route import Stages
-from pipeline.spec import NonNegative, Runtime, spec
+from pipeline.scoring import Scorer
+from pipeline.spec import NonNegative, PositiveFloat, Runtime, spec
 from pipeline.store import Store
 from pipeline.tally import Tally, human
 
-KEY_DIGITS = 12
 ROWS_SHOWN = 48  # a longer table goes to poses.json alone; the terminal shows one line per object
 
 
@@ -65,31 +63,45 @@ class Select:
 
 
 @spec
-class Options:
-    """What to do and where to write. ``label``: the variant of every stage; ``config``: the whole configuration."""
+class Evaluate:
+    """How poses are scored. ``models``: folder of the meshes errors are measured on, the dataset's where it is missing.
 
-    step: Literal["all", "onboard", "detect", "estimate"]
+    ``vsd_delta_mm``: how much deeper than the depth image a surface may lie and still count as visible (BOP: 15).
+    ``theta_max``: thresholds above it are left out of the averages.
+    """
+
+    vsd: bool = True
+    vsd_delta_mm: PositiveFloat = 15.0
+    models: str = "models_eval"
+    theta_max: Annotated[float, Field(ge=0.05, le=0.5)] = 0.5
+
+
+@spec
+class Options:
+    """What to do and where to write.
+
+    ``label``: the variant of every stage; ``config``: the whole configuration; ``resume``: leave a run alone whose row
+    says that it has ended well (jobs of sweeps).
+    """
+
+    step: Literal["all", "onboard", "detect", "estimate", "evaluate"]
     plan: bool
     out: str
     overlays: bool
+    gallery: NonNegative
+    sweep: str | None
+    evaluate: Evaluate
     threads: NonNegative
     method: str
     select: Select
     label: Mapping[str, str]
     config: Mapping[str, Any]
+    resume: bool = False
 
     @property
     def name(self) -> str:
         """The method's name in csv files: no underscores, as BOP asks."""
         return f"{self.method}-{self.label['extract']}".replace("_", "-")
-
-
-@dataclass(frozen=True)
-class Checked:
-    """An answer and, where there is ground truth and a pose, its errors."""
-
-    answer: Answer
-    judged: Judged | None
 
 
 def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtime, options: Options) -> None:
@@ -112,6 +124,57 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     else:
         _estimate(graph, options)
     print(f"\n{graph.run.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+
+
+def _estimate(graph: Graph, options: Options) -> None:
+    """Poses, and unless they alone are asked for, their scores; files, pictures and tables of both."""
+    scores = _scores(graph, options)
+    theta_max = options.evaluate.theta_max
+    outputs = Outputs(
+        graph, scores, Path(options.out), options.name, options.config, options.label, options.sweep, theta_max
+    )
+    if options.resume and scores is not None and outputs.finished():
+        print(f"finished before: {outputs.row_path}")
+        return
+    answers = graph.estimate()
+    judged = None if scores is None else scores.judge(answers)
+    outputs.write_files(answers, judged)
+    if options.overlays:
+        outputs.draw_overlays(answers, judged)
+    _show(answers, judged, theta_max=theta_max)
+    print(outputs.places(overlays=options.overlays))
+    if judged is not None:
+        cases: list[Case] = []
+        outputs.write_row(answers, judged, cases)
+
+
+def _scores(graph: Graph, options: Options) -> ScoreNodes | None:
+    """The node of the run's scores, None where poses alone are asked for or nothing is annotated."""
+    data, chosen = graph.run.dataset, options.evaluate
+    if options.step == "estimate":
+        return None
+    bare = sorted({t.scene_id for t in graph.run.targets if not data.has_ground_truth(t.scene_id)})
+    if bare:
+        if options.step == "evaluate":
+            where = data.root / data.split / f"{bare[0]:06d}"
+            raise BadInput(where, found="no scene_gt.json", needed="ground truth to evaluate against, or step=estimate")
+        return None
+    models = chosen.models if (data.root / chosen.models).is_dir() else data.models
+    scorer = Scorer(data, graph.run.targets, models, vsd_delta_mm=chosen.vsd_delta_mm, with_vsd=chosen.vsd)
+    return graph.scores(scorer)
+
+
+def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float) -> None:
+    """Tables for the terminal."""
+    errors: Sequence[PoseErrors | None] = [None] * len(answers) if judged is None else judged.of
+    rows = list(zip(answers, errors, strict=True))
+    print("\n" + (answers_table(rows) if len(rows) <= ROWS_SHOWN else objects_table(rows)))
+    missing = [answer for answer in answers if isinstance(answer, NoEstimate)]
+    if missing:
+        print("\n" + failures_table(missing))
+    print(f"\n{len(answers) - len(missing)} poses, {len(missing)} without (each with its reason)")
+    if judged is not None:
+        print(scores_table(judged.scored, theta_max=theta_max))
 
 
 def _use_threads(threads: int) -> None:
@@ -143,98 +206,28 @@ def plan_table(nodes: Sequence[Node]) -> str:
     return "\n".join(lines)
 
 
-def _estimate(graph: Graph, options: Options) -> None:
-    answers = graph.estimate()
-    checked = [Checked(answer, _judged(graph, answer)) for answer in answers]
-    data, key = graph.run.dataset, graph.poses.run_ref().key
-    csv = results_name(options.name, data.name, data.split)
-    folder = Path(options.out) / csv.removesuffix(".csv") / key[:KEY_DIGITS]
-    estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
-    write_results(folder / csv, rows_of(estimates, _seconds_by_image(answers)))
-    _write_record(folder / "poses.json", graph, options, checked)
-    if options.overlays:
-        _draw(graph, checked, folder / "overlays")
-    missing = [answer for answer in answers if isinstance(answer, NoEstimate)]
-    rows = [(c.answer, c.judged) for c in checked]
-    print("\n" + (answers_table(rows) if len(rows) <= ROWS_SHOWN else objects_table(rows)))
-    if missing:
-        print("\n" + failures_table(missing))
-    print(f"\n{len(estimates)} poses, {len(missing)} without (each with its reason)")
-    print(f"csv       {folder / csv}\nrecords   {folder / 'poses.json'}")
-    if options.overlays:
-        compared = any(c.judged for c in checked)
-        meaning = f"ground truth blue; green: MSSD < {CORRECT_MSSD:.0%} of the diameter" if compared else "estimates"
-        print(f"overlays  {folder / 'overlays'}  ({meaning})")
+def note_failure(out: str, config: Mapping[str, Any], overrides: Sequence[str], message: str) -> None:
+    """Leave a row that says that a job failed and why, unless the same configuration has ended well before."""
+    id_ = row_id(config)
+    if row_path(Path(out), id_).exists() and read_row(row_path(Path(out), id_)).status == "done":
+        return
+    row = Row(
+        id=id_,
+        status="failed",
+        at=now(),
+        method=str(config.get("method", "")),
+        config=config,
+        label={},
+        error=message,
+        overrides=tuple(overrides),
+        sweep=str(config.get("sweep") or ""),
+    )
+    write_row(Path(out), row)
 
 
-def _judged(graph: Graph, answer: Answer) -> Judged | None:
-    data = graph.run.dataset
-    if isinstance(answer, NoEstimate) or not data.has_ground_truth(answer.scene_id):
-        return None
-    truths = {
-        i: gt.T_cam_obj
-        for i, gt in enumerate(data.ground_truth(answer.scene_id, answer.im_id))
-        if gt.obj_id == answer.obj_id
-    }
-    return judge(answer, truths, graph.run.model(answer.obj_id)) if truths else None
+def make_report(out: str) -> None:
+    """The report of all rows below ``out``. Raises BadInput where there is none."""
+    from pipeline.report.page import write_report  # matplotlib, which no other step needs
 
-
-def _seconds_by_image(answers: Sequence[Answer]) -> dict[tuple[int, int], float]:
-    """BOP's time of an image: all its detections together, features included."""
-    seconds: defaultdict[tuple[int, int], float] = defaultdict(float)
-    for answer in answers:
-        if isinstance(answer, PoseEstimate):
-            seconds[answer.scene_id, answer.im_id] += sum(answer.times_s.values())
-    return dict(seconds)
-
-
-def _write_record(path: Path, graph: Graph, options: Options, checked: Sequence[Checked]) -> None:
-    answers = [record_of(c.answer) | {"errors": c.judged and c.judged.as_record()} for c in checked]
-    record = {
-        "run": graph.poses.run_ref().key,
-        "method": options.name,
-        "dataset": graph.run.dataset.name,
-        "config": options.config,
-        "counts": graph.run.tally.as_record(),
-        "answers": answers,
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(record, indent=1, allow_nan=False))
-    partial.replace(path)
-
-
-def _draw(graph: Graph, checked: Sequence[Checked], folder: Path) -> None:
-    by_image: defaultdict[tuple[int, int], list[Checked]] = defaultdict(list)
-    for c in checked:
-        by_image[c.answer.scene_id, c.answer.im_id].append(c)
-    start, drawn = time.perf_counter(), 0
-    with graph.run.tally.bar(len(by_image), "overlays", "image") as advance:
-        for (scene_id, im_id), shown in sorted(by_image.items()):
-            path = folder / f"{scene_id:06d}_{im_id:06d}.jpg"
-            if not path.exists():  # the folder's name is the key of all that is drawn
-                picture = draw_overlay(graph.run.dataset.image(scene_id, im_id), _drawn(graph, shown))
-                write_overlay(path, picture)
-                drawn += 1
-            advance(1)
-    seconds = time.perf_counter() - start
-    graph.run.tally.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
-
-
-def _drawn(graph: Graph, shown: Sequence[Checked]) -> list[Drawn]:
-    """Ground truth of the image's targets, and every estimate."""
-    data, first = graph.run.dataset, shown[0].answer
-    asked = {c.answer.obj_id for c in shown}
-    truths = data.ground_truth(first.scene_id, first.im_id) if data.has_ground_truth(first.scene_id) else []
-    drawn = [Drawn(graph.run.model(gt.obj_id).mesh, gt.T_cam_obj, "truth") for gt in truths if gt.obj_id in asked]
-    for c in shown:
-        if isinstance(c.answer, PoseEstimate):
-            label = f"{c.answer.obj_id}: {c.answer.score:.2f}"
-            drawn.append(Drawn(graph.run.model(c.answer.obj_id).mesh, c.answer.T_cam_obj, _role(c.judged), label))
-    return drawn
-
-
-def _role(judged: Judged | None) -> Literal["correct", "wrong", "unchecked"]:
-    if judged is None:
-        return "unchecked"
-    return "correct" if judged.correct else "wrong"
+    made = write_report(read_rows(Path(out)), Path(out))
+    print(made.summary)

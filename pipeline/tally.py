@@ -16,7 +16,9 @@ STEPS = (
     "query crops",
     "query features",
     "poses",
+    "scores",
     "overlays",
+    "gallery",
 )
 
 

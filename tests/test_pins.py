@@ -69,6 +69,14 @@ def toy_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def summary(name: str) -> list[float]:
     """A few numbers that any change of results would move."""
     stage, spec = name.split("/")[0], variant(name)
+    if name == "match/oracle":
+        views = rigid.look_at(np.random.default_rng(RNG_SEED).normal(size=(40, 3)) * 300)
+        found = spec.by_truth(views[7] @ rigid.look_at(np.array([[9.0, 3, 3]]))[0], np.eye(4)[None], views)
+        return [*found.index.tolist(), *found.score.tolist(), found.margin]
+    if name == "correspond/oracle":
+        px = torch.arange(40, dtype=torch.float64).reshape(20, 2) * 1.6
+        found = spec.by_truth(px, px + 0.25, disc(64))
+        return [float(len(found.similarity)), *found.query_px[:3].flatten().tolist()]
     if stage == "match":
         bank = toy_maps(9)[spec.layer]
         found = spec(toy_maps()[spec.layer] + bank[3], disc(64), bank, disc(64).expand(9, 64, 64))

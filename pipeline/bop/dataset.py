@@ -23,6 +23,8 @@ from pipeline.spec import spec
 
 # 0.13 is the most over the targets of LM-O and YCB-V that the tests read; a K of half the size gives 0.9 and more
 _OFF_DIAGONALS = 0.5
+BOP_WIDTH_PX = {"lm": 640, "lmo": 640, "ycbv": 640, "tless": 720, "tudl": 640, "icbin": 640, "hb": 640, "itodd": 1280}
+"""Widths of BOP's test images, for scoring without them."""
 
 
 @spec
@@ -96,6 +98,25 @@ class Dataset:
         """(h, w) of the photograph, from its header."""
         return image_size(self.image_path(scene_id, im_id))
 
+    def image_width(self, scene_id: int, im_id: int) -> int:
+        """Width of the photograph, px: from its file or its depth image's; where neither lies here, BOP's.
+
+        Raises BadInput when no file says it and the dataset is not one of BOP's.
+        """
+        for find in (self.image_path, self.depth_path):
+            try:
+                return image_size(find(scene_id, im_id))[1]
+            except BadInput:
+                continue
+        for path in sorted(self.root.glob("camera*.json")):
+            width = read_json(path).get("width")
+            if isinstance(width, int) and width > 0:
+                return width
+        if self.name in BOP_WIDTH_PX:
+            return BOP_WIDTH_PX[self.name]
+        where = place(self.scene(scene_id).folder, scene=scene_id, image=im_id)
+        raise BadInput(where, found="neither a photograph nor a depth image", needed="one of them, for its width")
+
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
         """The photograph's camera matrix."""
         return self.scene(scene_id).camera(im_id).K
@@ -155,12 +176,13 @@ def open_dataset(
     split: str = "test",
     models: str = "models",
     targets: str | None = "test_targets_bop19.json",
+    photographs: bool = True,
 ) -> Dataset:
     """The dataset at ``root``, with every target's image, camera and model seen to be there.
 
-    ``models``: folder of the meshes (T-LESS: models_cad or models_reconst). ``targets``: file of the targets; None, or
-    a file that is not there, asks for every annotated instance of every image. Only JSON files and image headers
-    are read. Raises BadInput for the first fault found.
+    ``photographs`` False: annotations and models alone, for scores. ``models``: folder of the meshes (T-LESS:
+    models_cad or models_reconst). ``targets``: file of the targets; None, or a file that is not there, asks for every
+    annotated instance of every image. Only JSON files and image headers are read. Raises BadInput for the first fault.
     """
     _check_folder(root, "the dataset", lambda folder: True)
     _check_folder(root / split, "a split", lambda folder: any(folder.glob("[0-9]" * 6)))
@@ -171,7 +193,7 @@ def open_dataset(
     dataset = replace(bare, targets=asked)
     for obj_id in dataset.object_ids:
         check_model_files(dataset.model_path(obj_id), obj_id, dataset.models_info)
-    for scene_id, im_id in dataset.images:
+    for scene_id, im_id in dataset.images if photographs else ():
         _check_image(dataset, scene_id, im_id)
     return dataset
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,15 @@ def results_name(method: str, dataset: str, split: str = "test") -> str:
     return f"{method}_{dataset}-{split.split('_')[0]}.csv"
 
 
+def name_parts(path: Path) -> tuple[str, str, str] | None:
+    """(method, dataset, split) of ``<method>_<dataset>-<split>.csv``, None for another name.
+
+    As BOP's tools read it: what follows the last part of the split, after a further underscore, is left out.
+    """
+    found = re.fullmatch(r"([^_]+)_([^_-]+)-([^_]+)(?:_.*)?", path.stem)
+    return (found[1], found[2], found[3]) if found and path.suffix == ".csv" else None
+
+
 def rows_of(
     estimates: Sequence[PoseEstimate], times_by_image: Mapping[tuple[int, int], float] | None = None
 ) -> list[ResultRow]:
@@ -74,23 +84,41 @@ def write_results(path: Path, rows: Iterable[ResultRow]) -> None:
 
 def read_results(path: Path) -> list[ResultRow]:
     """Rows in file order. Raises BadInput naming line and field for the first fault; the header line may be missing."""
+    rows, faults = scan_results(path)
+    if faults:
+        raise faults[0]
+    return rows
+
+
+def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
+    """All good rows in file order, and what is wrong with the others. Raises BadInput for an unreadable file."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        raise BadInput(path, found="no such file", needed="a BOP results csv") from None
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput(path, found=error, needed="a BOP results csv") from None
     rows: list[ResultRow] = []
+    faults: list[BadInput] = []
     times: dict[tuple[int, int], float] = {}
     for number, line in enumerate(lines, start=1):
         if not line.strip() or (number == 1 and [c.strip() for c in line.split(",")] == list(COLUMNS)):
             continue
-        where = f"{path}, line {number}"
-        row = _row(line, where)
-        known = times.setdefault((row.scene_id, row.im_id), row.time_s)
-        if abs(known - row.time_s) > _SAME_TIME_S:
-            found = f"{row.time_s:g} after {known:g} for scene {row.scene_id}, image {row.im_id}"
-            raise BadInput(f"{where}, field time", found=found, needed="one time for all rows of an image")
-        rows.append(row)
-    return rows
+        try:
+            row = _row(line, f"{path}, line {number}")
+            _check_time(row, times, f"{path}, line {number}")
+        except BadInput as fault:
+            faults.append(fault)
+        else:
+            rows.append(row)
+    return rows, faults
+
+
+def _check_time(row: ResultRow, times: dict[tuple[int, int], float], where: str) -> None:
+    known = times.setdefault((row.scene_id, row.im_id), row.time_s)
+    if abs(known - row.time_s) > _SAME_TIME_S:
+        found = f"{row.time_s:g} after {known:g} for scene {row.scene_id}, image {row.im_id}"
+        raise BadInput(f"{where}, field time", found=found, needed="one time for all rows of an image")
 
 
 def _line(row: ResultRow) -> str:

@@ -7,6 +7,7 @@ touches no template and no backbone.
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
 image, detections -> query crops -> query features (by timestep and layer)          queries.py
 template features, query features, stages -> poses (by scene and object) -> run     poses.py
+poses, ground truth -> scores                                                       scores.py
 """
 
 from __future__ import annotations
@@ -16,8 +17,12 @@ from pipeline.graph.context import Context
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
+from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
+from pipeline.scoring import Scorer
+
+__all__ = ["Context", "Graph", "Judged", "Node", "ScoreNodes"]
 
 
 class Graph:
@@ -56,6 +61,10 @@ class Graph:
         self.detect()  # first: a fault in its files must not wait for hours of onboarding
         self.onboard()
         return self.poses.estimate()
+
+    def scores(self, scorer: Scorer) -> ScoreNodes:
+        """The node of the poses' scores."""
+        return ScoreNodes(self.run, self.templates, self.poses, scorer)
 
     def plan(self) -> list[Node]:
         """Every node with its state, key, size and cost."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 from pipeline.errors import NoPose
@@ -13,7 +13,7 @@ from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_of, detection_record, record_of
 from pipeline.items.views import Detection, Target
-from pipeline.route import Query, Trace, template_pose, trace_pose
+from pipeline.route import Query, Trace, Truth, template_pose, trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
@@ -53,6 +53,9 @@ class PoseNodes:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.run.K(image).tolist()]
             asked += [detection_record(d) for _, d in self._detections(target)]
+            if stages.need_truth:
+                asked += [self._truth(d).T_cam_obj.tolist() for _, d in self._detections(target)]
+                asked += [self.run.model(obj_id).symmetries.tolist()]
             features = [self.queries.features(image, layer).key for layer in stages.layers]
             inputs[f"image {target.im_id}"] = digest([asked, self.queries.crops(image).key, features])
         return make_ref("poses", recipe, inputs)
@@ -119,16 +122,29 @@ class PoseNodes:
         return [self._answer(nth, index, d, cropped.get(index), bank) for nth, (index, d) in enumerate(mine)]
 
     def _answer(self, nth: int, index: int, d: Detection, found: Found | None, bank: StoredBank) -> Answer:
+        template_id: int | None = None
         try:
             if d.defect is not None:
                 raise NoPose("detect", d.defect)
             if found is None:
                 raise NoPose("crop", self.queries.crop_failure(index, d))
-            query, shared_s = self.queries.query(found)
+            query, shared_s = self.query(found)
             trace = trace_pose(self.run.stages, query, bank)
+            template_id = trace.best.template_id
             return self._estimate(nth, d, query, trace, bank, shared_s)
         except NoPose as failure:
-            return NoEstimate(d.scene_id, d.im_id, d.obj_id, failure.stage, failure.reason, nth, d.gt_id)
+            return NoEstimate(d.scene_id, d.im_id, d.obj_id, failure.stage, failure.reason, nth, d.gt_id, template_id)
+
+    def query(self, found: Found) -> tuple[Query, dict[str, float]]:
+        """A detection as the online route reads it, with the truth for an oracle alone; its share of the seconds."""
+        query, shared_s = self.queries.query(found)
+        if self.run.stages.need_truth:
+            query = replace(query, truth=self._truth(found.detection))
+        return query, shared_s
+
+    def _truth(self, d: Detection) -> Truth:
+        T_cam_obj = self.queries.true_pose(d, asked_by=self.run.stages.need_truth)
+        return Truth(T_cam_obj, self.run.model(d.obj_id).symmetries)
 
     def _estimate(
         self, nth: int, d: Detection, query: Query, trace: Trace, bank: StoredBank, shared_s: Mapping[str, float]

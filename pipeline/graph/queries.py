@@ -93,7 +93,7 @@ class QueryNodes:
         inputs = {"crops": self.crops(image).key}
         if self.run.stages.extract.needs_geometry:
             poses = [
-                [d.obj_id, self.run.model(d.obj_id).mesh.digest, self._true_pose(d).tolist()]
+                [d.obj_id, self.run.model(d.obj_id).mesh.digest, self.true_pose(d).tolist()]
                 for _, d in self.of_image[image]
             ]
             inputs["geometry"] = digest([poses, self.run.K(image).tolist()])
@@ -148,7 +148,7 @@ class QueryNodes:
         geometry = None
         if self.run.stages.extract.needs_geometry:
             photo = self.run.dataset.image(*image)
-            poses = [self._true_pose(found[row].detection) for row in rows]
+            poses = [self.true_pose(found[row].detection) for row in rows]
             depth = [
                 render_depth(self.run.model(found[row].detection.obj_id).mesh, photo.K, T[None], photo.rgb.shape[:2])[0]
                 for row, T in zip(rows, poses, strict=True)
@@ -156,10 +156,11 @@ class QueryNodes:
             geometry = Geometry(depth, np.repeat(photo.K[None], len(rows), 0), np.stack(poses))
         return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
 
-    def _true_pose(self, detection: Detection) -> np.ndarray:
+    def true_pose(self, detection: Detection, *, asked_by: str = "extract=coordinates") -> np.ndarray:
+        """T_cam_obj of the instance a detection was made of, for oracles. Raises BadInput for other detections."""
         if detection.gt_id is None:
             raise BadInput(
-                "extract=coordinates",
+                asked_by,
                 found="detections without ground truth",
                 needed="detect=gt_mask or detect=gt_bbox",
             )

@@ -26,6 +26,12 @@ class StoredBank:
     features: torch.Tensor
     mask: torch.Tensor
     view: Callable[[int], TemplateView]
+    poses: Callable[[], np.ndarray]
+
+    @cached_property
+    def T_cam_obj(self) -> np.ndarray:
+        """Poses of all templates; read when an oracle asks."""
+        return self.poses()
 
 
 @dataclass(eq=False)
@@ -119,6 +125,11 @@ class TemplateNodes:
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.run.stages.layers)
 
+    def feature_bytes(self) -> int:
+        """What the stored features of all objects take."""
+        refs = [self.features(obj_id, layer) for obj_id in self.run.object_ids for layer in self.run.stages.layers]
+        return sum(self.run.store.size(ref) or 0 for ref in refs)
+
     def bank(self, obj_id: int) -> StoredBank:
         """An object's templates for the online route."""
         layers = self.run.stages.layers
@@ -138,4 +149,5 @@ class TemplateNodes:
             )
 
         match_layer = features[self.run.stages.match.layer].array("maps")
-        return StoredBank(self.run.tensor(match_layer), self.run.tensor(crops.array("mask")), view)
+        mask = self.run.tensor(crops.array("mask"))
+        return StoredBank(self.run.tensor(match_layer), mask, view, lambda: templates.array("T_cam_obj"))

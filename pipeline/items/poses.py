@@ -48,7 +48,10 @@ class PoseEstimate:
 
 @dataclass(frozen=True)
 class NoEstimate:
-    """Why a target has no pose: the stage that gave up and its reason. ``detection_id`` None: nothing was detected."""
+    """Why a target has no pose: the stage that gave up and its reason.
+
+    ``detection_id`` None: nothing was detected; ``template_id`` None: no template was matched.
+    """
 
     scene_id: int
     im_id: int
@@ -57,3 +60,4 @@ class NoEstimate:
     reason: str
     detection_id: int | None = None
     gt_id: int | None = None
+    template_id: int | None = None

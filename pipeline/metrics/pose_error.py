@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from pipeline.functional.camera import project
 from pipeline.functional.rigid import rotation_angle_deg, transform
@@ -42,13 +42,10 @@ def adi(T_est: Pose, T_gt: Pose, vertices: Vertices) -> float:
 def mssd(T_est: Pose, T_gt: Pose, vertices: Vertices, symmetries: Float[np.ndarray, "s 4 4"]) -> float:
     """Maximum symmetry-aware surface distance, mm: over the symmetries, the least of the largest vertex distances.
 
-    Drost et al., ICCVW 2017; Hodan et al., ECCVW 2020, section 2.2.
+    Drost et al., ICCVW 2017; Hodan et al., ECCVW 2020, section 2.2. The distance between two placements is convex, so
+    the vertices of the convex hull (``hull_vertices``) give the same value as all of them.
     """
-    seen = transform(T_est, vertices)
-    return min(
-        float(np.linalg.norm(_placed(T_gt @ block, vertices) - seen, axis=-1).max(axis=-1).min())
-        for block in _blocks(symmetries, len(vertices))
-    )
+    return float(_largest_distance(T_est, T_gt, vertices, symmetries).min())
 
 
 def mspd(
@@ -57,13 +54,56 @@ def mspd(
     K: Float[np.ndarray, "3 3"],
     vertices: Vertices,
     symmetries: Float[np.ndarray, "s 4 4"],
+    probes: Vertices | None = None,
 ) -> float:
-    """Maximum symmetry-aware projection distance, pixels of the image of K (Hodan et al., ECCVW 2020, section 2.2)."""
+    """Maximum symmetry-aware projection distance, pixels of the image of K (Hodan et al., ECCVW 2020, section 2.2).
+
+    ``probes``: some of the vertices. Their largest distance is a lower bound for each symmetry, so that only few
+    symmetries are measured on all vertices; the value is the same.
+    """
     seen = project(K, transform(T_est, vertices))
-    return min(
-        float(np.linalg.norm(project(K, _placed(T_gt @ block, vertices)) - seen, axis=-1).max(axis=-1).min())
-        for block in _blocks(symmetries, len(vertices))
-    )
+    if probes is None or len(symmetries) == 1:
+        return float(_largest_shift(K, seen, T_gt, vertices, symmetries).min())
+    bound = _largest_shift(K, project(K, transform(T_est, probes)), T_gt, probes, symmetries)
+    best = np.inf
+    for index in np.argsort(bound):
+        if bound[index] >= best:
+            break
+        best = min(best, float(_largest_shift(K, seen, T_gt, vertices, symmetries[index : index + 1])[0]))
+    return best
+
+
+def hull_vertices(vertices: Vertices) -> Float[np.ndarray, "h 3"]:
+    """The vertices of the convex hull; all of them for a flat object."""
+    try:
+        return vertices[ConvexHull(vertices).vertices]
+    except QhullError:
+        return vertices
+
+
+def _largest_distance(
+    T_est: Pose, T_gt: Pose, vertices: Vertices, symmetries: Float[np.ndarray, "s 4 4"]
+) -> Float[np.ndarray, " s"]:
+    seen = transform(T_est, vertices)
+    blocks = _blocks(symmetries, len(vertices))
+    return _finite([np.linalg.norm(_placed(T_gt @ block, vertices) - seen, axis=-1).max(axis=-1) for block in blocks])
+
+
+def _largest_shift(
+    K: Float[np.ndarray, "3 3"],
+    seen_px: Float[np.ndarray, "v 2"],
+    T_gt: Pose,
+    vertices: Vertices,
+    symmetries: Float[np.ndarray, "s 4 4"],
+) -> Float[np.ndarray, " s"]:
+    blocks = _blocks(symmetries, len(vertices))
+    placed = (project(K, _placed(T_gt @ block, vertices)) for block in blocks)
+    return _finite([np.linalg.norm(px - seen_px, axis=-1).max(axis=-1) for px in placed])
+
+
+def _finite(blocks: list[Float[np.ndarray, " b"]]) -> Float[np.ndarray, " s"]:
+    """One array; a vertex in the camera's plane, which has no projection, counts as infinitely far."""
+    return np.nan_to_num(np.concatenate(blocks), nan=np.inf, posinf=np.inf)
 
 
 def _placed(T: Float[np.ndarray, "s 4 4"], vertices: Vertices) -> Float[np.ndarray, "s v 3"]:

@@ -9,9 +9,9 @@ import numpy as np
 
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
-from pipeline.metrics.judge import CORRECT_MSSD, Judged
+from pipeline.items.scores import CORRECT_MSSD, PoseErrors
 
-Checked = tuple[Answer, Judged | None]
+Checked = tuple[Answer, PoseErrors | None]
 
 
 def answers_table(rows: Sequence[Checked]) -> str:
@@ -27,7 +27,7 @@ def answers_table(rows: Sequence[Checked]) -> str:
             continue
         errors = f"{'-':>10}{'-':>9}{'-':>11}"
         if judged is not None:
-            errors = f"{judged.rotation_deg:>6.1f} deg{judged.translation_mm:>6.0f} mm"
+            errors = f"{judged.symmetric_rotation_deg:>6.1f} deg{judged.translation_mm:>6.0f} mm"
             errors += f"{judged.relative_mssd:>10.0%} "
         reprojection = "-" if answer.reprojection_px is None else f"{answer.reprojection_px:.2f} px"
         seconds = sum(answer.times_s.values())
@@ -52,9 +52,9 @@ def objects_table(rows: Sequence[Checked]) -> str:
         line = f"{obj_id:>6}{len(mine):>9}{poses:>7}"
         if errors:
             relative = np.array([j.relative_mssd for j in errors])
-            line += f"{np.median([j.rotation_deg for j in errors]):>8.1f} deg"
+            line += f"{np.median([j.symmetric_rotation_deg for j in errors]):>8.1f} deg"
             line += f"{np.median([j.translation_mm for j in errors]):>6.0f} mm{np.median(relative):>11.0%}"
-            line += f"{sum(j.correct for j in errors) / len(mine):>8.0%}"
+            line += f"{sum(j.looks_right for j in errors) / len(mine):>8.0%}"
         lines.append(line)
     return "\n".join(
         [*lines, f"medians over poses; right: share of all answers with MSSD below {CORRECT_MSSD:.0%} of the diameter"]

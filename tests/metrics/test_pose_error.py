@@ -1,13 +1,17 @@
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.bop.models import read_model, read_models_info
 from pipeline.functional.rigid import nearest_rotation, rigid
-from pipeline.metrics.pose_error import add, adi, mspd, mssd, rotation_error_deg, translation_error_mm
+from pipeline.metrics.pose_error import (
+    add,
+    adi,
+    hull_vertices,
+    mspd,
+    mssd,
+    rotation_error_deg,
+    translation_error_mm,
+)
 
 K = np.array([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]])
 NONE = np.eye(4)[None]
@@ -72,6 +76,28 @@ def test_blocks_of_symmetries_give_the_value_of_a_plain_loop():
     assert mssd(T_est, T_gt, vertices, turns) == pytest.approx(min(loop), rel=1e-12)  # same sums in another order
 
 
+def test_probes_leave_out_symmetries_and_change_no_value():
+    T_est, T_gt, vertices = pose(1), pose(2), cloud(0, n=500)
+    turns = rigid(
+        Rotation.from_rotvec(np.arange(315)[:, None] * 2 * np.pi / 315 * [0, 0, 1]).as_matrix(), np.zeros((315, 3))
+    )
+    everything = mspd(T_est, T_gt, K, vertices, turns)
+    for probes in (vertices[:1], vertices[:40], hull_vertices(vertices), vertices):
+        assert mspd(T_est, T_gt, K, vertices, turns, probes=probes) == pytest.approx(everything, rel=1e-12)
+
+
+def test_a_flat_object_has_all_its_vertices_for_a_hull():
+    flat = cloud(0) * [1, 1, 0]
+    assert len(hull_vertices(flat)) == len(flat)
+    assert len(hull_vertices(cloud(0, n=500))) < 250
+
+
+def test_a_vertex_in_the_plane_of_the_camera_is_infinitely_far():
+    T, vertices = rigid(np.eye(3), np.array([0.0, 0.0, 10.0])), np.array([[1.0, 1.0, -10.0], [0.0, 0.0, 5.0]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        assert mspd(T, pose(1), K, vertices, NONE) == np.inf
+
+
 def test_shift_and_turn_of_known_size():
     T = rigid(np.eye(3), np.array([0.0, 0.0, 500.0]))
     shifted = rigid(np.eye(3), np.array([3.0, 0.0, 504.0]))
@@ -98,27 +124,3 @@ def test_published_rotations_give_no_spurious_angle():
     published = rigid(R, np.zeros(3))  # LM-O, image 3, object 1: orthonormal to 1e-2 only
     # the nearest rotation differs by the skew part of the published error, far less than its arc cosine
     assert rotation_error_deg(rigid(nearest_rotation(R), np.zeros(3)), published) < 0.01
-
-
-def test_errors_are_those_of_bop_toolkit(bop_reference: Path):
-    reference = json.loads((bop_reference / "pose_errors.json").read_text())
-    infos = read_models_info(bop_reference / "models" / "models_info.json")
-    models = {i: read_model(bop_reference / "models" / f"obj_{i:06d}.ply", i, infos) for i in infos}
-    K_reference = np.array(reference["K"])
-    assert len(reference["cases"]) > 20
-    for case in reference["cases"]:
-        model = models[case["obj_id"]]
-        T_est = rigid(np.array(case["R_est"]), np.array(case["t_est"]).ravel())
-        T_gt = rigid(np.array(case["R_gt"]), np.array(case["t_gt"]).ravel())
-        vertices, symmetries = model.mesh.vertices, model.symmetries
-        ours = {
-            "mssd": mssd(T_est, T_gt, vertices, symmetries),
-            "mspd": mspd(T_est, T_gt, K_reference, vertices, symmetries),
-            "add": add(T_est, T_gt, vertices),
-            "adi": adi(T_est, T_gt, vertices),
-            "re_deg": rotation_error_deg(T_est, T_gt),
-            "te_mm": translation_error_mm(T_est, T_gt),
-        }
-        for name, value in ours.items():
-            # the evaluator's promise; mspd of far misses reaches 1e3 px, where 1e-6 is still 1e-9 of the value
-            assert value == pytest.approx(case[name], abs=1e-6), (name, case["obj_id"])

@@ -1,10 +1,13 @@
+import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import NoPose
+from pipeline.errors import BadInput, NoPose
 from pipeline.functional.masks import cell_mask
+from pipeline.functional.rigid import look_at, rigid, rotation_between
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.masked_cosine import MaskedCosine
+from pipeline.stages.match.oracle import Oracle
 
 VARIANTS = [Cosine(top_k=3), *(MaskedCosine(top_k=3, normalise=n) for n in ("intersection", "query", "union"))]
 
@@ -78,3 +81,22 @@ def test_empty_query_mask_says_why():
     bank, mask = _bank()
     with pytest.raises(NoPose, match="match: query mask is empty, needs 1 pixel"):
         MaskedCosine()(bank[0].float(), torch.zeros(32, 32, dtype=torch.bool), bank, mask)
+
+
+def test_the_oracle_takes_the_nearest_view_off_the_axis_and_up_to_symmetries():
+    T_cam_obj = look_at(np.array([[600.0, 0, 0], [0, 600.0, 0], [0, -600.0, 10], [0, 0, 600.0]]))
+    # the object of view 1, moved to the side of the image and turned with the viewing ray, looks the same
+    ray = rotation_between(np.array([0.0, 0, 1]), np.array([0.3, -0.2, 1.0]))
+    moved = rigid(ray @ T_cam_obj[1, :3, :3], ray @ T_cam_obj[1, :3, 3])
+    found = Oracle(top_k=2).by_truth(moved, np.eye(4)[None], T_cam_obj)
+    assert found.index.tolist()[0] == 1
+    assert float(found.score[0]) == pytest.approx(1, abs=1e-6)
+    half_turn = rigid(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    both = Oracle(top_k=2).by_truth(moved, np.stack([np.eye(4), half_turn]), T_cam_obj)
+    assert set(both.index.tolist()) == {1, 2}
+
+
+def test_the_oracle_cannot_work_without_the_truth():
+    bank, mask = _bank()
+    with pytest.raises(BadInput, match="match=oracle: found features, needs the true pose"):
+        Oracle()(bank[0].float(), mask[0], bank, mask)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -26,6 +27,22 @@ class Matcher(Variant, Protocol):
         bank_mask: Bool[Tensor, "n S S"],
     ) -> TemplateMatch:
         """The best templates of one query. Raises NoPose when nothing can be compared."""
+        ...
+
+
+@runtime_checkable
+class TruthMatcher(Protocol):
+    """An oracle that ranks templates by the true pose; no other matcher is shown it."""
+
+    needs_truth: ClassVar[bool]
+
+    def by_truth(
+        self,
+        T_true: Float[np.ndarray, "4 4"],
+        symmetries: Float[np.ndarray, "s 4 4"],
+        T_cam_obj: Float[np.ndarray, "n 4 4"],
+    ) -> TemplateMatch:
+        """The templates nearest to the true view."""
         ...
 
 

@@ -1,0 +1,121 @@
+"""poses, ground truth -> scores of a run: one entry, made once for every set of poses."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+
+from pipeline.bop.results import ResultRow
+from pipeline.digests import files_digest
+from pipeline.graph.context import Context
+from pipeline.graph.poses import PoseNodes
+from pipeline.graph.templates import TemplateNodes
+from pipeline.items.poses import PoseEstimate
+from pipeline.items.records import Answer
+from pipeline.items.scores import PoseErrors, TemplateError, errors_of, errors_record, scores_of, scores_record
+from pipeline.metrics.template_error import template_error
+from pipeline.scoring import SCORES_VERSION, Scored, Scorer, truth_digest
+from pipeline.store import Ref, make_ref
+
+Instance = tuple[int, int, int, int]
+"""(scene_id, im_id, obj_id, gt_id)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A run's answers held against the ground truth. ``of[i]``: errors of answer i against the instance it is of."""
+
+    scored: Scored
+    of: tuple[PoseErrors | None, ...]
+    templates: Mapping[Instance, TemplateError]
+
+
+@dataclass(eq=False)
+class ScoreNodes:
+    """The entry of a run's scores. ``scorer`` says what poses are held against."""
+
+    run: Context
+    templates: TemplateNodes
+    poses: PoseNodes
+    scorer: Scorer
+
+    @cached_property
+    def ref(self) -> Ref:
+        """Scores of the run's poses."""
+        scorer, data = self.scorer, self.run.dataset
+        recipe = {"kind": "scores", "version": SCORES_VERSION, "vsd_delta_mm": scorer.vsd_delta_mm}
+        depth = "" if scorer.no_vsd else files_digest({str(image): data.depth_path(*image) for image in scorer.images})
+        meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.run.object_ids}
+        info = data.model_path(0, folder=scorer.models).with_name("models_info.json")
+        if info.exists():
+            meshes["info"] = info
+        inputs = {"poses": self.poses.run_ref().key, "truth": truth_digest(scorer), "depth": depth or scorer.no_vsd}
+        return make_ref("scores", recipe, inputs | {"meshes": files_digest(meshes)})
+
+    def judge(self, answers: Sequence[Answer]) -> Judged:
+        """Scores of the run's answers, read or made."""
+        fresh = not self.run.store.complete(self.ref)
+        if fresh:
+            self._make(answers)
+        entry = self.run.store.read(self.ref)
+        seconds = entry.time_s if fresh else 0.0
+        self.run.tally.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
+        errors = tuple(errors_of(record) for record in entry.document["errors"])
+        templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
+        return Judged(Scored(errors, scores_of(entry.document["scores"])), _by_answer(answers, errors), templates)
+
+    def _make(self, answers: Sequence[Answer]) -> None:
+        start = time.perf_counter()
+        with self.run.tally.bar(len(self.scorer.images), "scores", "image") as advance:
+            scored = self.scorer.score([row for _, row in _rows(answers)], progress=advance)
+        of = _by_answer(answers, scored.errors)
+        angles = {
+            instance: error
+            for answer, errors in zip(answers, of, strict=True)
+            if (instance := _instance(answer, errors)) and (error := self._template_error(answer, instance))
+        }
+        document = {
+            "errors": [errors_record(errors) for errors in scored.errors],
+            "scores": scores_record(scored.scores),
+            "templates": [[*instance, *asdict(error).values()] for instance, error in angles.items()],
+        }
+        self.run.store.put_document(self.ref, document, rows=len(answers), time_s=time.perf_counter() - start)
+
+    def _template_error(self, answer: Answer, instance: Instance) -> TemplateError | None:
+        """How far the template that was matched lies from the true view; None where none was."""
+        if answer.template_id is None:
+            return None
+        scene_id, im_id, obj_id, gt_id = instance
+        T_template = self.templates.read_views(obj_id, [answer.template_id]).T_cam_obj[0]
+        T_gt = self.run.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
+        return template_error(T_template, T_gt, self.scorer.shape(obj_id).model.symmetries)
+
+
+def _rows(answers: Sequence[Answer]) -> list[tuple[int, ResultRow]]:
+    """The estimates among the answers as rows of results, each with its answer's index."""
+    return [
+        (index, ResultRow(a.scene_id, a.im_id, a.obj_id, a.score, a.T_cam_obj, -1.0))
+        for index, a in enumerate(answers)
+        if isinstance(a, PoseEstimate)
+    ]
+
+
+def _by_answer(answers: Sequence[Answer], errors: Sequence[PoseErrors]) -> tuple[PoseErrors | None, ...]:
+    """Errors of each answer against the instance its detection was made of, otherwise the one with least MSSD."""
+    by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
+    for error in errors:
+        by_row[error.row].append(error)
+    found: list[PoseErrors | None] = [None] * len(answers)
+    for row, (index, _) in enumerate(_rows(answers)):
+        own = [e for e in by_row[row] if e.gt_id == answers[index].gt_id] or by_row[row]
+        found[index] = min(own, key=lambda e: e.mssd_mm, default=None)
+    return tuple(found)
+
+
+def _instance(answer: Answer, errors: PoseErrors | None) -> Instance | None:
+    """The annotated instance an answer is of, None where nothing says which."""
+    gt_id = errors.gt_id if answer.gt_id is None and errors is not None else answer.gt_id
+    return None if gt_id is None else (answer.scene_id, answer.im_id, answer.obj_id, gt_id)

@@ -1,0 +1,91 @@
+"""scores -> recalls and average recalls, as the BOP challenge defines them (Hodan et al., ECCVW 2020, section 2.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.items.scores import Scores
+
+THETAS = np.arange(0.05, 0.51, 0.05)
+"""Upper bounds of an error that counts as correct: of VSD itself, and of MSSD as a part of the diameter."""
+TAUS = np.arange(0.05, 0.51, 0.05)
+"""Misalignment tolerances of VSD, as parts of the diameter."""
+MSPD_PX = np.arange(5, 51, 5)
+"""Upper bounds of MSPD in pixels of an image 640 wide."""
+METRICS = ("vsd", "mssd", "mspd")
+VISIBILITY_BINS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
+
+
+@dataclass(frozen=True)
+class AverageRecall:
+    """Average recalls, 0 to 1. ``vsd``, and with it ``ar``, is None when it is not available."""
+
+    vsd: float | None
+    mssd: float
+    mspd: float
+
+    @property
+    def ar(self) -> float | None:
+        """BOP's AR: mean of AR_VSD, AR_MSSD and AR_MSPD. None without VSD."""
+        return None if self.vsd is None else (self.vsd + self.mssd + self.mspd) / 3
+
+    @property
+    def mssd_mspd(self) -> float:
+        """Mean of AR_MSSD and AR_MSPD: not BOP's AR, and never to be called so."""
+        return (self.mssd + self.mspd) / 2
+
+    @property
+    def best(self) -> float:
+        """AR where VSD is available, otherwise the mean of the other two."""
+        return self.mssd_mspd if self.ar is None else self.ar
+
+
+def average_recall(scores: Scores, *, theta_max: float = 0.5) -> AverageRecall:
+    """Means over instances and thresholds; 0 for no instance.
+
+    ``theta_max`` leaves out the thresholds above it (the paper's figure "AR over error tolerance threshold"): theta of
+    VSD and MSSD, and 100 theta pixels of MSPD. VSD's tolerances tau stay.
+    """
+    found = instance_recalls(scores, theta_max=theta_max)
+    means = found.mean(axis=0) if len(found) else np.zeros(3)
+    return AverageRecall(None if scores.vsd is None else float(means[0]), float(means[1]), float(means[2]))
+
+
+def instance_recalls(scores: Scores, *, theta_max: float = 0.5) -> Float[np.ndarray, "n 3"]:
+    """Share of the thresholds at which each instance counts as found, for VSD (NaN when not available), MSSD, MSPD."""
+    kept = theta_max + 1e-9 >= THETAS
+    vsd = np.full(len(scores), np.nan) if scores.vsd is None else scores.vsd[:, :, kept].mean(axis=(1, 2))
+    return np.stack([vsd, scores.mssd[:, kept].mean(axis=1), scores.mspd[:, kept].mean(axis=1)], axis=1)
+
+
+def instance_ar(scores: Scores, *, theta_max: float = 0.5) -> Float[np.ndarray, " n"]:
+    """Each instance's part in AR: mean over the metrics that are available."""
+    found = instance_recalls(scores, theta_max=theta_max)
+    return found[:, 1:].mean(axis=1) if scores.vsd is None else found.mean(axis=1)
+
+
+def recall_by_threshold(scores: Scores) -> dict[str, Float[np.ndarray, " 10"]]:
+    """Recall at each of the ten thresholds, by metric; VSD's is the mean over its tolerances."""
+    by_metric = {"mssd": scores.mssd, "mspd": scores.mspd}
+    if scores.vsd is not None:
+        by_metric = {"vsd": scores.vsd.mean(axis=1)} | by_metric
+    return {name: found.mean(axis=0) if len(found) else np.zeros(10) for name, found in by_metric.items()}
+
+
+def by_object(scores: Scores) -> dict[int, AverageRecall]:
+    """Average recalls of each object."""
+    return {int(obj_id): average_recall(scores.of(scores.obj_id == obj_id)) for obj_id in np.unique(scores.obj_id)}
+
+
+def by_visibility(scores: Scores) -> dict[tuple[float, float], tuple[int, AverageRecall]]:
+    """Instances and average recalls by visible fraction; bins without an instance are left out."""
+    bins: dict[tuple[float, float], tuple[int, AverageRecall]] = {}
+    for low, high in VISIBILITY_BINS:
+        below = scores.visib_fract <= high if high == VISIBILITY_BINS[-1][1] else scores.visib_fract < high
+        chosen = (scores.visib_fract >= low) & below
+        if chosen.any():
+            bins[low, high] = int(chosen.sum()), average_recall(scores.of(chosen))
+    return bins

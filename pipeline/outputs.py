@@ -1,0 +1,213 @@
+"""answers and scores of a run -> its files: csv, records, overlays, gallery, and the row that reports read."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pipeline.bop.results import results_name, rows_of, write_results
+from pipeline.errors import BadInput
+from pipeline.graph import Graph, Judged, ScoreNodes
+from pipeline.items.poses import NoEstimate, PoseEstimate
+from pipeline.items.records import Answer, record_of
+from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, errors_record
+from pipeline.metrics.template_error import ACC_DEG
+from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
+from pipeline.report.rows import Case, Row, read_row, row_id, row_path, write_row
+from pipeline.report.scores import summary_of
+from pipeline.scoring import dataset_id
+
+KEY_DIGITS = 12
+ImageId = tuple[int, int]
+
+
+@dataclass(eq=False)
+class Outputs:
+    """Where a run's results lie and how they get there.
+
+    ``scores`` None: nothing is held against ground truth; ``label``: the variant of every stage; ``theta_max``:
+    thresholds above it are left out of the averages.
+    """
+
+    graph: Graph
+    scores: ScoreNodes | None
+    out: Path
+    name: str
+    config: Mapping[str, Any]
+    label: Mapping[str, str]
+    sweep: str | None
+    theta_max: float
+
+    @cached_property
+    def csv(self) -> str:
+        """Name of the results file."""
+        data = self.graph.run.dataset
+        return results_name(self.name, data.name, data.split)
+
+    @cached_property
+    def folder(self) -> Path:
+        """The run's folder: its name is the key of all that lies in it."""
+        return self.out / self.csv.removesuffix(".csv") / self.graph.poses.run_ref().key[:KEY_DIGITS]
+
+    @property
+    def overlays(self) -> Path:
+        """Folder of the overlays: another for poses that are not held against the ground truth there is."""
+        annotated = all(self.graph.run.dataset.has_ground_truth(t.scene_id) for t in self.graph.run.targets)
+        return self.folder / ("overlays" if self.scores or not annotated else "overlays-unchecked")
+
+    @cached_property
+    def row_path(self) -> Path:
+        """The file of the run's row."""
+        return row_path(self.out, row_id(self.config))
+
+    def finished(self) -> bool:
+        """Whether an earlier run of the same configuration, on the same inputs, has left all its files."""
+        if self.scores is None or not self.row_path.exists():
+            return False
+        try:
+            row = read_row(self.row_path)
+        except BadInput:
+            return False
+        return row.status == "done" and row.run == self.scores.ref.key and (self.out / row.folder / row.csv).exists()
+
+    def write_files(self, answers: Sequence[Answer], judged: Judged | None) -> None:
+        """The csv and poses.json."""
+        estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
+        write_results(self.folder / self.csv, rows_of(estimates, _seconds_by_image(answers)))
+        errors = _errors(answers, judged)
+        told = [record_of(a) | {"errors": e and errors_record(e)} for a, e in zip(answers, errors, strict=True)]
+        record = {
+            "run": self.graph.poses.run_ref().key,
+            "method": self.name,
+            "dataset": self.graph.run.dataset.name,
+            "config": self.config,
+            "counts": self.graph.run.tally.as_record(),
+            "scores": judged and summary_of(judged.scored),
+            "answers": told,
+        }
+        _write_json(self.folder / "poses.json", record)
+
+    def places(self, *, overlays: bool) -> str:
+        """Lines that say where everything lies."""
+        lines = [f"csv       {self.folder / self.csv}", f"records   {self.folder / 'poses.json'}"]
+        if overlays:
+            right = f"ground truth blue; green: MSSD < {CORRECT_MSSD:.0%} of the diameter"
+            lines.append(f"overlays  {self.overlays}  ({right if self.scores else 'estimates'})")
+        return "\n" + "\n".join(lines)
+
+    def draw_overlays(self, answers: Sequence[Answer], judged: Judged | None) -> None:
+        """A picture for every image; those that are there are left, since the folder is the key of what they show."""
+        by_image: defaultdict[ImageId, list[tuple[Answer, PoseErrors | None]]] = defaultdict(list)
+        for answer, errors in zip(answers, _errors(answers, judged), strict=True):
+            by_image[answer.scene_id, answer.im_id].append((answer, errors))
+        start, drawn = time.perf_counter(), 0
+        with self.graph.run.tally.bar(len(by_image), "overlays", "image") as advance:
+            for image, shown in sorted(by_image.items()):
+                path = self.overlays / f"{image[0]:06d}_{image[1]:06d}.jpg"
+                if not path.exists():
+                    write_overlay(path, draw_overlay(self.graph.run.dataset.image(*image), self._drawn(shown)))
+                    drawn += 1
+                advance(1)
+        seconds = time.perf_counter() - start
+        self.graph.run.tally.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
+
+    def _drawn(self, shown: Sequence[tuple[Answer, PoseErrors | None]]) -> list[Drawn]:
+        """Every estimate of an image and, where they are held against it, the ground truth of its targets."""
+        run, first = self.graph.run, shown[0][0]
+        asked = {answer.obj_id for answer, _ in shown} if self.scores else set()
+        truths = run.dataset.ground_truth(first.scene_id, first.im_id) if asked else []
+        drawn = [Drawn(run.model(gt.obj_id).mesh, gt.T_cam_obj, "truth") for gt in truths if gt.obj_id in asked]
+        for answer, errors in shown:
+            if isinstance(answer, PoseEstimate):
+                label = f"{answer.obj_id}: {answer.score:.2f}"
+                drawn.append(Drawn(run.model(answer.obj_id).mesh, answer.T_cam_obj, _role(errors), label))
+        return drawn
+
+    def write_row(self, answers: Sequence[Answer], judged: Judged, cases: Sequence[Case]) -> None:
+        """The row that reports read."""
+        assert self.scores is not None
+        run, scores = self.graph.run, judged.scored.scores
+        metrics = summary_of(judged.scored, theta_max=self.theta_max)["metrics"]
+        missing = Counter((a.stage, a.reason) for a in answers if isinstance(a, NoEstimate))
+        row = Row(
+            id=row_id(self.config),
+            status="done",
+            at=now(),
+            method=self.name,
+            config=self.config,
+            label=self.label,
+            sweep=self.sweep or "",
+            notice=run.stages.extract.notice,
+            dataset=dataset_id(self.scores.scorer),
+            run=self.scores.ref.key,
+            folder=self.folder.relative_to(self.out).as_posix(),
+            csv=self.csv,
+            estimates=sum(isinstance(answer, PoseEstimate) for answer in answers),
+            counts=run.tally.as_record(),
+            times_s=_median_times(answers),
+            bytes_per_object=self.graph.templates.feature_bytes() / max(len(run.object_ids), 1),
+            failures=tuple((stage, reason, count) for (stage, reason), count in missing.most_common()),
+            metrics=metrics | _template_metrics(judged, len(scores)),
+            scores=scores,
+            templates=judged.templates,
+            cases=tuple(cases),
+        )
+        print(f"row       {write_row(self.out, row)}")
+
+
+def now() -> str:
+    """The time, as rows say it."""
+    return datetime.now(UTC).isoformat(timespec="microseconds")
+
+
+def _errors(answers: Sequence[Answer], judged: Judged | None) -> Sequence[PoseErrors | None]:
+    return [None] * len(answers) if judged is None else judged.of
+
+
+def _role(errors: PoseErrors | None) -> Literal["correct", "wrong", "unchecked"]:
+    if errors is None:
+        return "unchecked"
+    return "correct" if errors.looks_right else "wrong"
+
+
+def _seconds_by_image(answers: Sequence[Answer]) -> dict[ImageId, float]:
+    """BOP's time of an image: all its detections together, features included."""
+    seconds: defaultdict[ImageId, float] = defaultdict(float)
+    for answer in answers:
+        if isinstance(answer, PoseEstimate):
+            seconds[answer.scene_id, answer.im_id] += sum(answer.times_s.values())
+    return dict(seconds)
+
+
+def _median_times(answers: Sequence[Answer]) -> dict[str, float]:
+    """Median seconds of a pose by stage."""
+    times = [answer.times_s for answer in answers if isinstance(answer, PoseEstimate)]
+    stages = dict.fromkeys(stage for by_stage in times for stage in by_stage)
+    return {stage: float(np.median([by_stage.get(stage, 0.0) for by_stage in times])) for stage in stages}
+
+
+def _template_metrics(judged: Judged, instances: int) -> dict[str, float | None]:
+    """Acc15 in its three readings, over all instances, and the mean angle, over those with a matched template."""
+    told: dict[str, float | None] = {}
+    for reading in (f.name for f in fields(TemplateError)):
+        angles = np.array([getattr(error, reading) for error in judged.templates.values()])
+        told[f"Acc{ACC_DEG:.0f}_{reading}"] = float((angles < ACC_DEG).sum() / max(instances, 1))
+        told[f"template_error_{reading}_deg"] = float(angles.mean()) if len(angles) else None
+    return told
+
+
+def _write_json(path: Path, record: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_text(json.dumps(record, indent=1, allow_nan=False))
+    partial.replace(path)

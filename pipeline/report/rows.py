@@ -1,0 +1,134 @@
+"""What a run leaves behind for reports: one JSON file, ``<out>/rows/<id>.json``, whether it ended well or failed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.errors import BadInput
+from pipeline.items.scores import DatasetId, Scores, TemplateError, scores_of, scores_record
+from pipeline.spec import digest
+
+FORMAT = 1
+FOLDER = "rows"
+# none of these changes an answer or a score
+UNTOLD = ("step", "plan", "out", "overlays", "gallery", "threads", "runtime", "store", "hydra", "sweep", "report")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One picture of the gallery. ``file`` is relative to the row's folder; ``relative_mssd`` MSSD over diameter."""
+
+    file: str
+    scene_id: int
+    im_id: int
+    obj_id: int
+    relative_mssd: float | None
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One run.
+
+    ``config``: the whole resolved configuration; ``label``: the variant of every stage; ``counts``: rows computed and
+    reused and seconds by step; ``times_s``: median seconds of a target by stage; ``failures``: (stage, reason, count)
+    of answers without a pose; ``templates``: template errors of the instances that had an answer, by
+    (scene_id, im_id, obj_id, gt_id); ``metrics``: the figures a person looks for first; ``folder``: of csv, records
+    and pictures, relative to ``out``. A failed run has ``error``, the ``overrides`` of
+    its job, and nothing of what it did not reach.
+    """
+
+    id: str
+    status: Literal["done", "failed"]
+    at: str
+    method: str
+    config: Mapping[str, Any]
+    label: Mapping[str, str]
+    error: str = ""
+    overrides: tuple[str, ...] = ()
+    sweep: str = ""
+    notice: str = ""
+    dataset: DatasetId | None = None
+    run: str = ""
+    folder: str = ""
+    csv: str = ""
+    estimates: int = 0
+    counts: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    times_s: Mapping[str, float] = field(default_factory=dict)
+    bytes_per_object: float = 0.0
+    failures: tuple[tuple[str, str, int], ...] = ()
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    scores: Scores | None = None
+    templates: Mapping[tuple[int, int, int, int], TemplateError] = field(default_factory=dict)
+    cases: tuple[Case, ...] = ()
+
+
+def row_id(config: Mapping[str, Any]) -> str:
+    """Identity of a run: its configuration without what changes no answer."""
+    return digest({name: value for name, value in config.items() if name not in UNTOLD})[:16]
+
+
+def row_path(out: Path, id_: str) -> Path:
+    """The row's file."""
+    return out / FOLDER / f"{id_}.json"
+
+
+def write_row(out: Path, row: Row) -> Path:
+    """Write a row; a reader sees the whole file or none."""
+    path = row_path(out, row.id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_text(json.dumps({"format": FORMAT, **_record(row)}, allow_nan=False))
+    partial.replace(path)
+    return path
+
+
+def read_row(path: Path) -> Row:
+    """A row. Raises BadInput for a file that is none."""
+    try:
+        record = json.loads(path.read_text())
+        if record.pop("format") != FORMAT:
+            raise BadInput(path, found="a row of another version", needed=f"format {FORMAT}: run it again")
+        return _row(record)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise BadInput(path, found=found, needed="a row that a run has written; remove the file") from None
+
+
+def read_rows(out: Path) -> list[Row]:
+    """All rows below ``out``, oldest first. Raises BadInput for a broken one and where there is none."""
+    paths = sorted((out / FOLDER).glob("*.json"))
+    if not paths:
+        raise BadInput(out / FOLDER, found="no row", needed="the rows of runs: run step=all (or evaluate) first")
+    return sorted((read_row(path) for path in paths), key=lambda row: (row.at, row.id))
+
+
+def _record(row: Row) -> dict[str, Any]:
+    plain = {f.name: getattr(row, f.name) for f in fields(row) if f.name not in ("scores", "templates")}
+    plain["dataset"] = row.dataset and asdict(row.dataset)
+    plain["cases"] = [asdict(case) for case in row.cases]
+    plain["scores"] = None if row.scores is None else scores_record(row.scores)
+    plain["templates"] = [[*instance, *asdict(error).values()] for instance, error in row.templates.items()]
+    return plain
+
+
+def _row(record: dict[str, Any]) -> Row:
+    dataset = record.pop("dataset")
+    cases = tuple(Case(**case) for case in record.pop("cases"))
+    scores = record.pop("scores")
+    templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in record.pop("templates")}
+    record["overrides"] = tuple(record["overrides"])
+    failures = tuple((stage, reason, count) for stage, reason, count in record.pop("failures"))
+    return Row(
+        **record,
+        dataset=dataset and DatasetId(**{**dataset, "objects": tuple(dataset["objects"])}),
+        cases=cases,
+        scores=None if scores is None else scores_of(scores),
+        templates=templates,
+        failures=failures,
+    )

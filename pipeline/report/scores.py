@@ -1,0 +1,116 @@
+"""scores -> the table a terminal shows, and the figures as numbers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from pipeline.items.scores import PoseErrors
+from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
+from pipeline.metrics.recall import (
+    AverageRecall,
+    average_recall,
+    by_object,
+    by_visibility,
+    instance_recalls,
+    recall_by_threshold,
+)
+from pipeline.scoring import Scored
+
+ADD_LIMIT = 0.1
+"""ADD and ADI count as right below this part of the diameter (Hinterstoisser et al., ACCV 2012)."""
+
+
+def scores_table(scored: Scored, *, theta_max: float = 0.5) -> str:
+    """Average recalls with their intervals, by object and by visible fraction; and why VSD is not there, if so."""
+    scores = scored.scores
+    recall = average_recall(scores, theta_max=theta_max)
+    spread = intervals(scored, theta_max=theta_max)
+    lines = [f"\n{'':<10}{'AR':>8}{'AR_VSD':>10}{'AR_MSSD':>10}{'AR_MSPD':>10}"]
+    lines.append(_line("all", recall, f"{len(scores)} instances"))
+    for name in ("AR", "AR_VSD", "AR_MSSD", "AR_MSPD"):
+        if name in spread:
+            lines.append(f"  {name} 95 % interval over images: {spread[name].low:.3f} to {spread[name].high:.3f}")
+    for obj_id, mine in by_object(scores).items():
+        lines.append(_line(f"object {obj_id}", mine, f"{int((scores.obj_id == obj_id).sum())} instances"))
+    for (low, high), (count, mine) in by_visibility(scores).items():
+        lines.append(_line("visible", mine, f"{low:.0%} to {high:.0%}, {count} instances"))
+    if scores.no_vsd:
+        lines.append(f"VSD, and with it AR, is not available: {scores.no_vsd}")
+        lines.append(f"mean of AR_MSSD and AR_MSPD: {recall.mssd_mspd:.4f}")
+    return "\n".join([*lines, _errors_line(scored)])
+
+
+def intervals(scored: Scored, *, theta_max: float = 0.5) -> dict[str, Interval]:
+    """Bootstrap intervals over images, by metric; those that are not available are left out."""
+    scores = scored.scores
+    values, image = instance_recalls(scores, theta_max=theta_max), image_index(scores.scene_id, scores.im_id)
+    columns = {"AR_VSD": values[:, 0], "AR_MSSD": values[:, 1], "AR_MSPD": values[:, 2]}
+    if scores.vsd is None:
+        del columns["AR_VSD"]
+    else:
+        columns = {"AR": values.mean(axis=1)} | columns
+    return {name: mean_interval(column, image) for name, column in columns.items()}
+
+
+def summary_of(scored: Scored, *, theta_max: float = 0.5) -> dict[str, Any]:
+    """Every figure, JSON-able; None for what is not available."""
+    scores, recall = scored.scores, average_recall(scored.scores, theta_max=theta_max)
+    return {
+        "metrics": metrics_of(recall) | error_recalls(scored),
+        "no_vsd": scores.no_vsd,
+        "instances": len(scores),
+        "intervals_95": {name: [i.low, i.high] for name, i in intervals(scored, theta_max=theta_max).items()},
+        "objects": {str(obj_id): metrics_of(mine) for obj_id, mine in by_object(scores).items()},
+        "visibility": [
+            {"from": low, "to": high, "instances": count, **metrics_of(mine)}
+            for (low, high), (count, mine) in by_visibility(scores).items()
+        ],
+        "recall_by_threshold": {name: found.tolist() for name, found in recall_by_threshold(scores).items()},
+    }
+
+
+def metrics_of(recall: AverageRecall) -> dict[str, float | None]:
+    """Average recalls under their names in BOP."""
+    return {"AR": recall.ar, "AR_VSD": recall.vsd, "AR_MSSD": recall.mssd, "AR_MSPD": recall.mspd}
+
+
+def error_recalls(scored: Scored) -> dict[str, float | None]:
+    """Shares of the instances that an estimate hits within 0.1 diameters by ADD and ADI; medians over estimates."""
+    nearest = _nearest(scored)
+    found = dict.fromkeys(("recall_ADD", "recall_ADI"), 0.0)
+    for error in nearest:
+        found["recall_ADD"] += (error.add_mm < ADD_LIMIT * error.diameter_mm) / max(len(scored.scores), 1)
+        found["recall_ADI"] += (error.adi_mm < ADD_LIMIT * error.diameter_mm) / max(len(scored.scores), 1)
+    medians: dict[str, float | None] = {"median_rotation_deg": None, "median_translation_mm": None}
+    if nearest:
+        medians["median_rotation_deg"] = float(np.median([e.symmetric_rotation_deg for e in nearest]))
+        medians["median_translation_mm"] = float(np.median([e.translation_mm for e in nearest]))
+    return {**found, **medians}
+
+
+def _nearest(scored: Scored) -> list[PoseErrors]:
+    """Each estimate's errors against the instance it is nearest to by MSSD."""
+    by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
+    for error in scored.errors:
+        by_row[error.row].append(error)
+    return [min(errors, key=lambda e: e.mssd_mm) for errors in by_row.values()]
+
+
+def _line(name: str, recall: AverageRecall, remark: str) -> str:
+    cells = "".join(
+        f"{'n/a' if value is None else format(value, '.4f'):>{width}}"
+        for value, width in zip(metrics_of(recall).values(), (8, 10, 10, 10), strict=True)
+    )
+    return f"{name:<10}{cells}   {remark}"
+
+
+def _errors_line(scored: Scored) -> str:
+    values = error_recalls(scored)
+    line = f"ADD < 0.1 diameters: {values['recall_ADD']:.4f}, ADI: {values['recall_ADI']:.4f} of the instances"
+    if values["median_rotation_deg"] is None:
+        return line
+    rotation, shift = values["median_rotation_deg"], values["median_translation_mm"]
+    return f"{line}; medians over estimates: {rotation:.1f} degrees (symmetry-aware), {shift:.0f} mm"

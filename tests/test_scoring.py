@@ -1,0 +1,131 @@
+"""Scores of whole datasets: real ground truth, and a tiny dataset where two instances share an image."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_bop import edit_json, write_tiny_bop
+
+from pipeline.bop.dataset import Dataset, open_dataset
+from pipeline.bop.results import ResultRow
+from pipeline.errors import BadInput
+from pipeline.functional.rigid import rigid
+from pipeline.metrics.recall import average_recall
+from pipeline.scoring import Scorer, truth_digest
+
+
+def opened(root, name: str, models: str = "models_eval") -> Dataset:
+    return open_dataset(root, name=name, models=models, photographs=False)
+
+
+def true_rows(scorer: Scorer, *, symmetry: int | None = None) -> list[ResultRow]:
+    """Ground truth as results; ``symmetry``: turned by that symmetry of each object."""
+    rows = []
+    for target in scorer.targets:
+        for gt in scorer.counted(target):
+            symmetries = scorer.shape(target.obj_id).model.symmetries
+            turn = np.eye(4) if symmetry is None else symmetries[symmetry % len(symmetries)]
+            rows.append(ResultRow(target.scene_id, target.im_id, target.obj_id, 1.0, gt.T_cam_obj @ turn, -1.0))
+    return rows
+
+
+@pytest.mark.parametrize("symmetry", [None, 1, 17])
+@pytest.mark.parametrize("name", ["lmo", "ycbv"])
+def test_ground_truth_scores_one_and_so_it_does_turned_by_a_symmetry(bop_mini, name, symmetry):
+    data = opened(bop_mini / name, name)
+    scorer = Scorer(data, data.targets, "models_eval")
+    recall = average_recall(scorer.score(true_rows(scorer, symmetry=symmetry)).scores)
+    assert (recall.mssd, recall.mspd) == (1.0, 1.0)
+    if name == "ycbv":
+        assert recall.vsd == recall.ar == 1.0
+
+
+def test_missing_depth_images_leave_vsd_out_and_say_so(bop_mini):
+    data = opened(bop_mini / "lmo", "lmo")
+    scorer = Scorer(data, data.targets, "models_eval")
+    scored = scorer.score(true_rows(scorer))
+    assert scored.scores.vsd is None
+    assert scored.scores.no_vsd.startswith("39 of 40 images have no depth image")
+    assert average_recall(scored.scores).ar is None
+    only = tuple(t for t in data.targets if t.im_id == 3)
+    with_depth = Scorer(data, only, "models_eval")
+    assert average_recall(with_depth.score(true_rows(with_depth)).scores).vsd == 1.0
+
+
+@pytest.fixture
+def tiny(tmp_path) -> Scorer:
+    data = opened(write_tiny_bop(tmp_path / "tiny"), "tiny", "models")
+    return Scorer(data, data.targets, "models")
+
+
+def test_every_instance_of_a_target_is_found_by_an_estimate_of_its_own(tiny):
+    rows = true_rows(tiny)
+    assert len(rows) == 4
+    found = tiny.score(rows).scores
+    assert found.instances() == [(7, 0, 1, 0), (7, 0, 1, 1), (7, 0, 2, 2), (7, 3, 2, 0)]
+    assert (average_recall(found).mssd, average_recall(found).mspd) == (1.0, 1.0)
+    # the wall at 400 mm hides instance 2: nothing of it is visible, which VSD counts as a miss
+    assert found.vsd.all(axis=(1, 2)).tolist() == [True, True, False, True]
+    # one pose given twice finds one instance
+    twice = tiny.score([rows[0], rows[0], *rows[2:]]).scores
+    assert twice.mssd.all(axis=1).tolist() == [True, False, True, True]
+    assert average_recall(twice).mspd == 0.75
+
+
+def test_only_as_many_estimates_count_as_a_target_asks_for(tiny):
+    rows = true_rows(tiny)
+    wrong = rigid(Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.array([0.0, 0.0, 900.0]))
+    better = [ResultRow(7, 3, 2, 2.0, wrong, -1.0), *rows]  # a higher score than the true one's
+    assert average_recall(tiny.score(better).scores).mssd == 0.75
+    worse = [ResultRow(7, 3, 2, 0.5, wrong, -1.0), *rows]
+    assert average_recall(tiny.score(worse).scores).mssd == 1.0
+
+
+def test_of_more_instances_than_asked_for_the_most_visible_count(tiny, tmp_path):
+    edit_json(tmp_path / "tiny" / "test_targets_bop19.json", lambda targets: targets[0].update(inst_count=1))
+    data = opened(tmp_path / "tiny", "tiny", "models")
+    scorer = Scorer(data, data.targets, "models")
+    # instance 0 is half hidden, instance 1 not at all
+    assert (7, 0, 1, 1) in scorer.score([]).scores.instances()
+    assert (7, 0, 1, 0) not in scorer.score([]).scores.instances()
+    (tmp_path / "tiny" / "test" / "000007" / "scene_gt_info.json").unlink()
+    data = opened(tmp_path / "tiny", "tiny", "models")
+    with pytest.raises(BadInput, match="needs scene_gt_info.json, to take the most visible"):
+        Scorer(data, data.targets, "models").score([])
+
+
+def test_no_estimate_is_a_miss_and_no_fault(tiny):
+    recall = average_recall(tiny.score([]).scores)
+    assert (recall.vsd, recall.mssd, recall.mspd) == (0.0, 0.0, 0.0)
+
+
+def test_projection_errors_count_in_pixels_of_an_image_640_wide(tiny):
+    row = true_rows(tiny)[3]
+    T = row.T_cam_obj.copy()
+    T[0, 3] += 10.0
+    shifted = ResultRow(row.scene_id, row.im_id, row.obj_id, 1.0, T, -1.0)
+    (errors,) = tiny.score([shifted]).errors
+    near = row.T_cam_obj[2, 3] - 40.0  # the near face of object 2 moves most
+    assert errors.mspd_px == pytest.approx(80.0 * 10 / near * 640 / 64)
+    assert errors.mssd_mm == pytest.approx(10.0)
+
+
+def test_turning_and_moving_the_camera_changes_no_distance(tiny):
+    """Errors in the object's frame do not depend on where the camera's axes point."""
+    row = true_rows(tiny)[2]
+    off = rigid(Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([3.0, -2.0, 5.0]))
+    est = row.T_cam_obj @ off
+    (errors,) = tiny.score([ResultRow(row.scene_id, row.im_id, row.obj_id, 1.0, est, -1.0)]).errors
+    vertices = tiny.shape(row.obj_id).vertices
+    moved = np.linalg.norm(vertices @ off[:3, :3].T + off[:3, 3] - vertices, axis=1)
+    assert errors.mssd_mm == pytest.approx(moved.max())
+    assert errors.add_mm == pytest.approx(moved.mean())
+    assert errors.rotation_deg == pytest.approx(np.rad2deg(np.linalg.norm([0.1, 0.2, 0.3])))
+
+
+def test_another_annotation_is_another_dataset(tiny, tmp_path):
+    before = truth_digest(tiny)
+    assert before == truth_digest(tiny)
+    path = tmp_path / "tiny" / "test" / "000007" / "scene_gt.json"
+    edit_json(path, lambda scenes: scenes["3"][0].update(cam_t_m2c=[10.0, 0.0, 401.0]))
+    data = opened(tmp_path / "tiny", "tiny", "models")
+    assert truth_digest(Scorer(data, data.targets, "models")) != before
