@@ -7,7 +7,7 @@ import os
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +17,12 @@ import numpy as np
 
 from pipeline.bop.results import results_name, rows_of, write_results
 from pipeline.errors import BadInput
-from pipeline.graph import Graph, Judged, ScoreNodes
+from pipeline.graph import Graph, Judged, Retraced, ScoreNodes
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, record_of
 from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, errors_record
 from pipeline.metrics.template_error import ACC_DEG
+from pipeline.report.gallery import Card, draw_card, pick_cases
 from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
 from pipeline.report.rows import Case, Row, read_row, row_id, row_path, write_row
 from pipeline.report.scores import summary_of
@@ -121,12 +122,57 @@ class Outputs:
         seconds = time.perf_counter() - start
         self.graph.run.tally.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
 
-    def _drawn(self, shown: Sequence[tuple[Answer, PoseErrors | None]]) -> list[Drawn]:
-        """Every estimate of an image and, where they are held against it, the ground truth of its targets."""
+    def draw_gallery(self, answers: Sequence[Answer], judged: Judged, count: int) -> list[Case]:
+        """Pictures of how the best and the worst answers came about; those that are there are left."""
+        if not count:
+            return []
+        start, drawn, cases = time.perf_counter(), 0, []
+        retrace, errors = self.graph.retracer(), _errors(answers, judged)
+        chosen = pick_cases([None if e is None else e.relative_mssd for e in errors], count=count)
+        with self.graph.run.tally.bar(len(chosen), "gallery", "picture") as advance:
+            for index in sorted(chosen, key=lambda i: answers[i].obj_id):
+                answer = answers[index]
+                path = self.folder / "gallery" / f"{_named(answer)}.jpg"
+                if not path.exists() and (traced := retrace(answer)) is not None:
+                    write_overlay(path, draw_card(self._card(answer, errors[index], traced)), quality=82)
+                    drawn += 1
+                advance(1)
+        cases = [self._case(answers[index], errors[index]) for index in chosen]
+        seconds = time.perf_counter() - start
+        self.graph.run.tally.add("gallery", computed=drawn, reused=len(chosen) - drawn, time_s=seconds)
+        return [case for case in cases if (self.folder / case.file).exists()]
+
+    def _card(self, answer: Answer, errors: PoseErrors | None, traced: Retraced) -> Card:
+        best = traced.hypothesis
+        return Card(
+            photo=self.graph.run.dataset.image(answer.scene_id, answer.im_id),
+            bbox_xyxy=traced.detection.bbox_xyxy,
+            drawn=[replace(item, label="") for item in self._drawn([(answer, errors)], gt_id=answer.gt_id)],
+            query_rgb=traced.query_rgb,
+            template_rgb=traced.template_rgb,
+            clusters=None if best is None else best.clusters,
+            matches=None if best is None else best.matches,
+            inliers=best.solution.inliers if best and best.solution else None,
+            reason=f"{answer.stage}: {answer.reason}" if isinstance(answer, NoEstimate) else "",
+        )
+
+    def _case(self, answer: Answer, errors: PoseErrors | None) -> Case:
+        text = f"{answer.stage}: {answer.reason}" if isinstance(answer, NoEstimate) else f"score {answer.score:.2f}"
+        if errors is not None:
+            text += f", {errors.symmetric_rotation_deg:.0f} degrees and {errors.translation_mm:.0f} mm off"
+        ids, file = (answer.scene_id, answer.im_id, answer.obj_id), f"gallery/{_named(answer)}.jpg"
+        return Case(file, *ids, None if errors is None else errors.relative_mssd, text)
+
+    def _drawn(self, shown: Sequence[tuple[Answer, PoseErrors | None]], *, gt_id: int | None = None) -> list[Drawn]:
+        """Every estimate of an image and, where they are held against it, the ground truth of its targets.
+
+        ``gt_id``: of this instance alone.
+        """
         run, first = self.graph.run, shown[0][0]
         asked = {answer.obj_id for answer, _ in shown} if self.scores else set()
         truths = run.dataset.ground_truth(first.scene_id, first.im_id) if asked else []
-        drawn = [Drawn(run.model(gt.obj_id).mesh, gt.T_cam_obj, "truth") for gt in truths if gt.obj_id in asked]
+        wanted = [gt for gt in truths if gt.obj_id in asked and gt_id in (None, gt.gt_id)]
+        drawn = [Drawn(run.model(gt.obj_id).mesh, gt.T_cam_obj, "truth") for gt in wanted]
         for answer, errors in shown:
             if isinstance(answer, PoseEstimate):
                 label = f"{answer.obj_id}: {answer.score:.2f}"
@@ -172,6 +218,11 @@ def now() -> str:
 
 def _errors(answers: Sequence[Answer], judged: Judged | None) -> Sequence[PoseErrors | None]:
     return [None] * len(answers) if judged is None else judged.of
+
+
+def _named(answer: Answer) -> str:
+    """Name of an answer's picture."""
+    return f"{answer.scene_id:06d}_{answer.im_id:06d}_{answer.obj_id:06d}_{answer.detection_id or 0:02d}"
 
 
 def _role(errors: PoseErrors | None) -> Literal["correct", "wrong", "unchecked"]:

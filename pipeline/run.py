@@ -20,7 +20,7 @@ from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Target
 from pipeline.outputs import KEY_DIGITS, Outputs, now
-from pipeline.report.rows import Case, Row, read_row, read_rows, row_id, row_path, write_row
+from pipeline.report.rows import Row, read_row, read_rows, row_id, row_path, write_row
 from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
 from pipeline.route import Stages
@@ -84,7 +84,7 @@ class Options:
     says that it has ended well (jobs of sweeps).
     """
 
-    step: Literal["all", "onboard", "detect", "estimate", "evaluate"]
+    step: Literal["all", "onboard", "detect", "estimate", "evaluate", "report"]
     plan: bool
     out: str
     overlays: bool
@@ -144,7 +144,7 @@ def _estimate(graph: Graph, options: Options) -> None:
     _show(answers, judged, theta_max=theta_max)
     print(outputs.places(overlays=options.overlays))
     if judged is not None:
-        cases: list[Case] = []
+        cases = outputs.draw_gallery(answers, judged, options.gallery)
         outputs.write_row(answers, judged, cases)
 
 

@@ -1,5 +1,6 @@
 """Runs the command line in this process, as a shell would, and gives back what it printed."""
 
+import re
 import sys
 from dataclasses import dataclass
 
@@ -20,8 +21,8 @@ class Ran:
         for line in self.out.splitlines():
             if line.startswith("step ") and "computed" in line:
                 tables.append({})
-            elif tables and len(line) == 50 and not line.startswith("whole run"):
-                tables[-1][line[:20].strip()] = (int(line[20:30]), int(line[30:40]))
+            elif tables and (row := re.fullmatch(r"([a-z ]{20}) +(\d+) +(\d+) +\d+\.\d", line)):
+                tables[-1][row[1].strip()] = (int(row[2]), int(row[3]))
         return tables
 
 

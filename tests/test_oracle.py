@@ -8,9 +8,10 @@ from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
 from pipeline.graph import Context, Graph
 from pipeline.items.poses import PoseEstimate
+from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Crops, Geometry
-from pipeline.metrics.judge import Judged, judge
 from pipeline.route import Query, Stages, TemplateView, trace_pose
+from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
@@ -59,15 +60,13 @@ def store(tmp_path_factory) -> Store:
     return Store(LocalStoreConfig(root=str(tmp_path_factory.mktemp("oracle") / "cache")))
 
 
-def errors(scenes: Dataset, store: Store, **changes: object) -> list[Judged]:
+def errors(scenes: Dataset, store: Store, **changes: object) -> list[PoseErrors]:
     stages = Stages(**{**vars(FULL), **changes})
     graph = Graph(Context(stages, scenes, scenes.targets, store, Runtime(progress=False)))
-    judged = []
-    for answer in graph.estimate():
-        assert isinstance(answer, PoseEstimate), answer
-        truths = {gt.gt_id: gt.T_cam_obj for gt in scenes.ground_truth(answer.scene_id, answer.im_id)}
-        judged.append(judge(answer, {answer.gt_id: truths[answer.gt_id]}, graph.run.model(answer.obj_id)))
-    return judged
+    answers = graph.estimate()
+    judged = graph.scores(Scorer(scenes, scenes.targets, "models", with_vsd=False)).judge(answers)
+    assert all(isinstance(answer, PoseEstimate) for answer in answers)
+    return [found for found in judged.of if found is not None]
 
 
 @pytest.mark.slow
@@ -77,7 +76,7 @@ def test_poses_from_true_coordinates_are_exact_to_a_degree_and_a_hundredth_of_th
     assert len(fractions) >= 60
     assert 0.4 <= np.mean(np.array(fractions) < 0.95) <= 0.6
     judged = errors(scenes, store, **ABLATIONS[name])
-    rotation = float(np.median([j.rotation_deg for j in judged]))
+    rotation = float(np.median([j.symmetric_rotation_deg for j in judged]))
     translation = float(np.median([j.translation_mm / j.diameter_mm for j in judged]))
     with capsys.disabled():
         print(

@@ -89,7 +89,7 @@ def test_of_more_instances_than_asked_for_the_most_visible_count(tiny, tmp_path)
     assert (7, 0, 1, 0) not in scorer.score([]).scores.instances()
     (tmp_path / "tiny" / "test" / "000007" / "scene_gt_info.json").unlink()
     data = opened(tmp_path / "tiny", "tiny", "models")
-    with pytest.raises(BadInput, match="needs scene_gt_info.json, to take the most visible"):
+    with pytest.raises(BadInput, match=r"needs scene_gt_info\.json, to take the most visible"):
         Scorer(data, data.targets, "models").score([])
 
 

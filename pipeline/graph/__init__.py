@@ -17,12 +17,13 @@ from pipeline.graph.context import Context
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
+from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
 from pipeline.scoring import Scorer
 
-__all__ = ["Context", "Graph", "Judged", "Node", "ScoreNodes"]
+__all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
 
 
 class Graph:
@@ -65,6 +66,10 @@ class Graph:
     def scores(self, scorer: Scorer) -> ScoreNodes:
         """The node of the poses' scores."""
         return ScoreNodes(self.run, self.templates, self.poses, scorer)
+
+    def retracer(self) -> Retracer:
+        """Shows how answers came about."""
+        return Retracer(self.templates, self.queries, self.poses)
 
     def plan(self) -> list[Node]:
         """Every node with its state, key, size and cost."""

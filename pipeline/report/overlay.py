@@ -52,8 +52,8 @@ class Drawn:
     label: str = ""
 
 
-def draw_overlay(image: Image, items: Sequence[Drawn]) -> UInt8[np.ndarray, "H W 3"]:
-    """The photograph with each pose's silhouette outline, 3D box and label, and a legend.
+def draw_overlay(image: Image, items: Sequence[Drawn], *, legend: bool = True) -> UInt8[np.ndarray, "H W 3"]:
+    """The photograph with each pose's silhouette outline, 3D box and label, and a legend unless there is to be none.
 
     Images under 1000 px are enlarged by a whole factor (at most 4). The box is the mesh's axis-aligned one in the
     object frame. What lies behind the camera is left out.
@@ -72,15 +72,15 @@ def draw_overlay(image: Image, items: Sequence[Drawn]) -> UInt8[np.ndarray, "H W
     for item in ordered:
         thickness = width + 1 if item.role == "truth" else width
         _lines(canvas, _outlines(item, K, (h, w)), _COLOURS[item.role], thickness)
-    return _written(canvas, ordered, K)
+    return _written(canvas, ordered, K, legend=legend)
 
 
-def write_overlay(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
+def write_overlay(path: Path, picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 90) -> None:
     """Write a picture as its suffix says (.jpg, .png); a reader sees the whole file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
-        PIL.Image.fromarray(picture).save(partial, quality=90)
+        PIL.Image.fromarray(picture).save(partial, quality=quality)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -141,7 +141,7 @@ def _lines(
 
 
 def _written(
-    canvas: UInt8[np.ndarray, "H W 3"], items: Sequence[Drawn], K: Float[np.ndarray, "3 3"]
+    canvas: UInt8[np.ndarray, "H W 3"], items: Sequence[Drawn], K: Float[np.ndarray, "3 3"], *, legend: bool
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The canvas with labels and, at the lower left, a legend of the roles drawn."""
     picture = PIL.Image.fromarray(canvas)
@@ -153,7 +153,8 @@ def _written(
         if item.label and (segments := _box_segments(item, K)):
             x, y = np.min(np.concatenate(segments), axis=0)
             taken.append(_label(draw, font, item.label, (float(x), float(y) - 1.6 * size), item.role, taken))
-    _draw_legend(draw, font, size, [role for role in _COLOURS if any(item.role == role for item in items)])
+    if legend:
+        _draw_legend(draw, font, size, [role for role in _COLOURS if any(item.role == role for item in items)])
     return np.asarray(picture).copy()
 
 

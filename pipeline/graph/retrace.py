@@ -1,0 +1,60 @@
+"""answer -> how it came about: the online route once more, from stored features, for pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.errors import NoPose
+from pipeline.graph.poses import PoseNodes
+from pipeline.graph.queries import QueryNodes
+from pipeline.graph.templates import StoredBank, TemplateNodes
+from pipeline.items.records import Answer
+from pipeline.items.views import Detection
+from pipeline.route import Hypothesis, trace_pose
+
+
+@dataclass(frozen=True, eq=False)
+class Retraced:
+    """A detection's crop, its best template's crop and what became of the two; None for what was not reached."""
+
+    detection: Detection
+    query_rgb: UInt8[np.ndarray, "S S 3"]
+    template_rgb: UInt8[np.ndarray, "S S 3"] | None = None
+    hypothesis: Hypothesis | None = None
+
+
+@dataclass(eq=False)
+class Retracer:
+    """Traces answers of one run again; an object's templates are read once."""
+
+    templates: TemplateNodes
+    queries: QueryNodes
+    poses: PoseNodes
+
+    @cached_property
+    def _bank(self):
+        return lru_cache(maxsize=2)(self._read_bank)
+
+    def _read_bank(self, obj_id: int) -> StoredBank:
+        return self.templates.bank(obj_id)
+
+    def __call__(self, answer: Answer) -> Retraced | None:
+        """How an answer came about; None where there is no crop to show."""
+        if answer.detection_id is None:
+            return None
+        run, image = self.queries.run, (answer.scene_id, answer.im_id)
+        index, detection = self.queries.of_target[*image, answer.obj_id][answer.detection_id]
+        found = next((f for f in self.queries.found(image) if f.index == index), None)
+        if found is None:
+            return None
+        query_rgb = run.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
+        try:
+            best = trace_pose(run.stages, self.poses.query(found)[0], self._bank(answer.obj_id)).best
+        except NoPose:
+            return Retraced(detection, query_rgb)
+        crops = run.store.read(self.templates.crops(answer.obj_id))
+        return Retraced(detection, query_rgb, crops.array("rgb", [best.template_id])[0], best)
