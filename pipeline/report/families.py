@@ -1,0 +1,100 @@
+"""rows -> families that differ from one base run in one thing each: the curves of ablations, whoever ran them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.report.rows import UNTOLD, Row
+
+# the scores of a row hold all thresholds; rows of one section share their targets
+_SAME_SCORES = {"evaluate", "dataset", "select", "method", "variation"}
+MOST_FAMILIES = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Runs that differ in ``axis`` alone ("cluster.count", or "solve" for another variant), in the order of it."""
+
+    axis: str
+    base: Row
+    rows: tuple[Row, ...]
+    values: tuple[Any, ...]
+
+    @property
+    def numeric(self) -> bool:
+        """Whether the values have a place on a line."""
+        return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in self.values)
+
+
+def settings(row: Row) -> dict[str, Any]:
+    """What a row's answers depend on, by dotted field; the variant of a stage under the stage's own name."""
+    found: dict[str, Any] = {}
+    for name, value in row.config.items():
+        if name in UNTOLD or name in _SAME_SCORES:
+            continue
+        if isinstance(value, Mapping) and "_target_" in value:
+            found[name] = value["_target_"].rsplit(".", 2)[-2]
+            found |= {f"{name}.{field}": _plain(v) for field, v in value.items() if field != "_target_"}
+        else:
+            found[name] = _plain(value)
+    return found
+
+
+def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+    """``theirs`` where it differs from ``ours``; another variant is one difference, whatever its fields are."""
+    stages = {name for name in {*ours, *theirs} if "." not in name and ours.get(name) != theirs.get(name)}
+    fields = {
+        name
+        for name in {*ours, *theirs}
+        if "." in name and name.split(".")[0] not in stages and ours.get(name) != theirs.get(name)
+    }
+    return {name: theirs.get(name) for name in sorted(stages | fields)}
+
+
+def base_of(rows: Sequence[Row]) -> Row:
+    """The run that most others are a step away from; of equals the first."""
+    asked = [settings(row) for row in rows]
+    near = [sum(len(difference(mine, other)) == 1 for other in asked) for mine in asked]
+    return rows[max(range(len(rows)), key=lambda i: (near[i], bool(rows[i].config), -i))]
+
+
+def families(rows: Sequence[Row]) -> list[Family]:
+    """All families of rows of one dataset, the widest base first. Rows of switched-off or oracle parts are left out."""
+    left = [row for row in rows if row.config and row.config.get("variation", "none") == "none"]
+    left = list({str(settings(row)): row for row in reversed(left)}.values())[::-1]
+    found: list[Family] = []
+    while len(left) > 1 and len(found) < MOST_FAMILIES:
+        base = base_of(left)
+        of_base = _around(base, left)
+        if not of_base:
+            break
+        found += of_base
+        taken = {row.id for family in of_base for row in family.rows}
+        left = [row for row in left if row.id not in taken]
+    return found[:MOST_FAMILIES]
+
+
+def _around(base: Row, rows: Sequence[Row]) -> list[Family]:
+    by_axis: dict[str, list[tuple[Row, Any]]] = {}
+    for row in rows:
+        changed = difference(settings(base), settings(row))
+        if len(changed) == 1:
+            ((axis, value),) = changed.items()
+            by_axis.setdefault(axis, []).append((row, value))
+    families_ = []
+    for axis, members in sorted(by_axis.items(), key=lambda item: -len(item[1])):
+        members.append((base, settings(base).get(axis)))
+        ordered = sorted(members, key=lambda member: _order(member[1]))
+        families_.append(Family(axis, base, tuple(r for r, _ in ordered), tuple(v for _, v in ordered)))
+    return families_
+
+
+def _order(value: Any) -> tuple[int, float, str]:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return (0, float(value), "") if is_number else (1, 0.0, str(value))
+
+
+def _plain(value: Any) -> Any:
+    return tuple(_plain(v) for v in value) if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,283 @@
+"""rows of many runs -> one HTML page that needs nothing else, figures as PNG and PDF, tables as CSV and LaTeX."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+
+import jinja2
+import PIL.Image
+
+from pipeline.items.scores import Scores
+from pipeline.report import figures, tables
+from pipeline.report.families import Family, base_of, families
+from pipeline.report.figures import Figure, ar_interval, ar_name
+from pipeline.report.rows import Row
+from pipeline.report.tables import Table, run_name
+
+FOLDER = "report"
+PICTURES_BYTES = 9_000_000
+"""Pictures are embedded until they take as much; the page stays below 15 MB."""
+_CARD_PX = 486
+_METHODS_SHOWN = 6
+_TIMES_SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Report:
+    """Where a report lies, and what it says in short."""
+
+    page: Path
+    summary: str
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture of the gallery: JPEG as a data address, and its caption."""
+
+    data: str
+    text: str
+
+
+@dataclass(eq=False)
+class Section:
+    """Everything about the runs on one set of targets; nothing is compared across sections."""
+
+    rows: Sequence[Row]
+    title: str
+
+    @cached_property
+    def base(self) -> Row:
+        """The run that the others are held against."""
+        return base_of(self.rows)
+
+    @cached_property
+    def best(self) -> Row:
+        """The run with the highest recall; oracles, which see the truth, are no candidates."""
+        honest = [row for row in self.rows if not _is_oracle(row)] or list(self.rows)
+        return max(honest, key=lambda row: ar_interval(_scored(row)).mean)
+
+    @cached_property
+    def dataset(self) -> str:
+        """The dataset's name."""
+        return self.base.dataset.name if self.base.dataset else ""
+
+    @property
+    def anchor(self) -> str:
+        """Where the page's contents lead to."""
+        return f"d-{self.base.dataset.key[:8]}" if self.base.dataset else "d"
+
+    @property
+    def metric(self) -> str:
+        """What the recall that runs are ordered by is called."""
+        return ar_name(_scored(self.base))
+
+    @property
+    def no_vsd(self) -> str:
+        """Why VSD is not available."""
+        return _scored(self.base).no_vsd
+
+    @property
+    def notices(self) -> list[str]:
+        """What must be known of the features behind the numbers."""
+        return list(dict.fromkeys(f"{row.method}: {row.notice}" for row in self.rows if row.notice))
+
+    @cached_property
+    def methods(self) -> list[tuple[str, Row]]:
+        """One run of each method, the base run's first, of each the one nearest to it."""
+        chosen = {self.base.method: self.base}
+        for row in sorted(self.rows, key=lambda row: len(run_name(row, self.base))):
+            if not _is_oracle(row):
+                chosen.setdefault(row.method, row)
+        return list(chosen.items())[:_METHODS_SHOWN]
+
+    @cached_property
+    def families(self) -> list[Family]:
+        """The ablations."""
+        return families(self.rows)
+
+    def name(self, row: Row) -> str:
+        """A run by what sets it apart."""
+        return run_name(row, self.base)
+
+    def headline(self) -> str:
+        """The best run in a sentence."""
+        spread = ar_interval(_scored(self.best))
+        return (
+            f"{self.metric} {spread.mean:.3f} (95 % over images: {spread.low:.3f} to {spread.high:.3f}) "
+            f"by {self.name(self.best)}"
+        )
+
+    def figures(self) -> dict[str, list[Figure]]:
+        """Figures by the part of the page they stand in."""
+        shown = dict(self.methods)
+        if self.best.id != self.base.id:
+            shown.setdefault(f"{self.name(self.best)} (best)", self.best)
+        visible = figures.visibility_figure(self.base)
+        timed = {self.name(row): row for row in self.rows if row.times_s and self._timed(row)}
+        return {
+            "recalls": [
+                figures.objects_figure(shown, self.dataset),
+                figures.theta_figure(shown, self.dataset),
+                figures.thresholds_figure(self.base),
+                *([visible] if visible else []),
+            ],
+            "ablations": [figures.family_figure(family) for family in self.families],
+            "times": [figures.times_figure(dict(list(timed.items())[:_TIMES_SHOWN]))] if timed else [],
+        }
+
+    def _timed(self, row: Row) -> bool:
+        return row in dict(self.methods).values() or row.config.get("variation", "none").startswith("no_")
+
+    def tables(self) -> dict[str, list[Table]]:
+        """Measured tables by the part of the page they stand in."""
+        by_part: dict[str, list[Table | None]] = {
+            "runs": [tables.runs_table(self.rows, self.base), tables.templates_table(self.methods)],
+            "ablations": [*map(tables.family_table, self.families)],
+            "parts": [tables.correspondence_table(self.rows), tables.ladder_table(self.rows)],
+            "methods": [tables.improvement_table(self.methods)],
+            "times": [tables.times_table(self.methods), tables.counts_table(self.rows, self.base)],
+            "failures": [tables.failures_table(self.rows, self.base)],
+        }
+        return {part: [table for table in made if table is not None] for part, made in by_part.items()}
+
+    def galleries(self) -> list[Row]:
+        """Runs whose pictures are shown: the base run's, and the best one's."""
+        return [row for row in dict.fromkeys([self.base, self.best, *self.rows]) if row.cases][:2]
+
+
+def write_report(rows: Sequence[Row], out: Path) -> Report:
+    """Write the page of all rows, its figures and tables to ``out/report``; a reader sees a whole page or the old."""
+    folder = out / FOLDER
+    sections = sections_of(rows)
+    failed = [row for row in rows if row.status == "failed"]
+    pictures = _Pictures(out)
+    parts = []
+    for section in sections:
+        drawn, told = section.figures(), section.tables()
+        _write_files(folder, section, drawn, told)
+        galleries = [(section.name(row), pictures.of(row)) for row in section.galleries()]
+        parts.append({"it": section, "figures": drawn, "tables": told, "galleries": galleries})
+    published = tables.published_tables()
+    for table in published:
+        _write_table(folder / "tables", table)
+    text = _template().render(
+        parts=parts,
+        failed=failed,
+        published=published,
+        runs=len(rows),
+        left_out=pictures.left_out,
+        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    )
+    _write_text(folder / "index.html", text)
+    return Report(folder / "index.html", _summary(sections, failed, folder))
+
+
+def sections_of(rows: Sequence[Row]) -> list[Section]:
+    """Rows with scores by the targets they are of, the newest first; sections of one name are told apart."""
+    by_key: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.dataset is not None and row.scores is not None:
+            by_key.setdefault(row.dataset.key, []).append(row)
+    found = []
+    for key, mine in sorted(by_key.items(), key=lambda item: item[1][-1].at, reverse=True):
+        data = mine[0].dataset
+        assert data is not None
+        twice = sum(other.name == data.name for group in by_key.values() if (other := group[0].dataset)) > 1
+        title = f"{data.name} {data.split}: {data.targets} targets, {data.images} images, {len(data.objects)} objects"
+        found.append(Section(mine, f"{title} ({key[:6]})" if twice else title))
+    return found
+
+
+class _Pictures:
+    """Pictures of runs, small enough to travel in the page, as long as there is room."""
+
+    def __init__(self, out: Path) -> None:
+        self.out, self.used, self.left_out = out, 0, 0
+
+    def of(self, row: Row) -> list[Shown]:
+        shown = []
+        for case in row.cases:
+            path = self.out / row.folder / case.file
+            data = self._jpeg(path) if path.is_file() else b""
+            if not data or self.used + len(data) > PICTURES_BYTES:
+                self.left_out += 1
+                continue
+            self.used += len(data)
+            part = "" if case.relative_mssd is None else f", MSSD {case.relative_mssd:.0%} of the diameter"
+            text = f"scene {case.scene_id}, image {case.im_id}, object {case.obj_id}: {case.text}{part}"
+            shown.append(Shown("data:image/jpeg;base64," + base64.b64encode(data).decode(), text))
+        return shown
+
+    @staticmethod
+    def _jpeg(path: Path) -> bytes:
+        try:
+            with PIL.Image.open(path) as opened:
+                picture = opened.convert("RGB")
+        except (OSError, SyntaxError, ValueError):
+            return b""
+        if picture.width > _CARD_PX:
+            picture = picture.resize((_CARD_PX, round(picture.height * _CARD_PX / picture.width)))
+        stream = io.BytesIO()
+        picture.save(stream, "JPEG", quality=80, optimize=True)
+        return stream.getvalue()
+
+
+def _template() -> jinja2.Template:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.get_template("page.html.j2")
+
+
+def _write_files(folder: Path, section: Section, drawn: dict[str, list[Figure]], told: dict[str, list[Table]]) -> None:
+    """Figures and tables as files, in folders named by dataset and targets."""
+    own = f"{section.dataset}_{section.anchor.removeprefix('d-')}"
+    (folder / "figures" / own).mkdir(parents=True, exist_ok=True)
+    names: dict[str, int] = {}
+    for figure in (figure for part in drawn.values() for figure in part):
+        figure.save(str(folder / "figures" / own / _once(figure.name, names)))
+    names = {}
+    for table in (table for part in told.values() for table in part):
+        _write_table(folder / "tables" / own, table, _once(table.name, names))
+
+
+def _once(name: str, names: dict[str, int]) -> str:
+    names[name] = names.get(name, 0) + 1
+    return name if names[name] == 1 else f"{name}_{names[name]}"
+
+
+def _write_table(folder: Path, table: Table, name: str | None = None) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_text(folder / f"{name or table.name}.csv", table.csv())
+    _write_text(folder / f"{name or table.name}.tex", table.latex())
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def _summary(sections: Sequence[Section], failed: Sequence[Row], folder: Path) -> str:
+    lines = [f"{section.title}: {len(section.rows)} runs; {section.headline()}" for section in sections]
+    lines += [f"failed: {' '.join(row.overrides)} ({row.error})" for row in failed]
+    lines.append(f"page      {folder / 'index.html'}\nfigures   {folder / 'figures'}\ntables    {folder / 'tables'}")
+    return "\n".join(lines)
+
+
+def _is_oracle(row: Row) -> bool:
+    return "oracle" in row.label.values() or row.label.get("extract") == "coordinates"
+
+
+def _scored(row: Row) -> Scores:
+    assert row.scores is not None
+    return row.scores
