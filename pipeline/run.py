@@ -115,7 +115,8 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     graph.check()
     print(_headline(options, stages, data, targets, store), flush=True)
     if options.plan:
-        print(plan_table(graph.plan()))
+        scores = _scores(graph, options)
+        print(plan_table([*graph.plan(), *([scores.node()] if scores else [])]))
         return
     if options.step == "onboard":
         graph.onboard()

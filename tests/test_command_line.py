@@ -1,6 +1,7 @@
 """The command line from end to end, on a small synthetic dataset that is written once."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 
 from pipeline.bop.images import read_mask
 from pipeline.bop.results import read_results
+from pipeline.report.rows import read_rows
 from pipeline.synthetic.scenes import write_dataset
 
 SMALL = (
@@ -115,6 +117,56 @@ def test_a_plan_computes_nothing_and_shows_every_node(dzop, tmp_path):
     warm = dzop("plan=true").out
     assert "missing" not in warm
     assert "nodes cached" in warm
+
+
+def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, scene, cache, capsys, monkeypatch):
+    ran = dzop(f"store.root={cache}", "gallery=2")
+    assert ran.status == 0
+    (row,) = read_rows(tmp_path / "results")
+    assert row.label["extract"] == "hog"
+    assert row.counts["poses"]["computed"] + row.counts["poses"]["reused"] == 4
+    assert set(row.times_s) >= {"crop", "extract", "match", "cluster", "solve"}
+    assert len(row.cases) == 2
+    assert all((tmp_path / "results" / row.folder / case.file).exists() for case in row.cases)
+    assert len(row.templates) == 4
+    told = json.loads((results(tmp_path) / "poses.json").read_text())["scores"]["metrics"]
+    csv = str(next(tmp_path.glob("results/*/*/*.csv")))
+    scored = run_dzop(capsys, monkeypatch, "score", csv, "--dataset", str(scene), "--json", "scored.json")
+    assert scored.status == 0, scored.err
+    same = json.loads(Path("scored.json").read_text())["metrics"]
+    assert {name: same[name] for name in told} == pytest.approx(told)
+    assert row.metrics["AR"] == pytest.approx(same["AR"])
+    assert same["AR_VSD"] is not None
+
+
+def test_poses_alone_are_held_against_nothing(dzop, tmp_path, cache):
+    ran = dzop(f"store.root={cache}", "step=estimate")
+    assert ran.status == 0
+    assert "AR_MSSD" not in ran.out
+    assert not (tmp_path / "results" / "rows").exists()
+
+
+def test_what_is_not_annotated_cannot_be_evaluated(dzop, tmp_path, scene, cache):
+    shutil.copytree(scene, tmp_path / "bare")
+    for path in (tmp_path / "bare" / "test" / "000001").glob("scene_gt*.json"):
+        path.unlink()
+    targets = [{"scene_id": 1, "im_id": 0, "obj_id": 1, "inst_count": 1}]
+    (tmp_path / "bare" / "test_targets_bop19.json").write_text(json.dumps(targets))
+    found = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [100, 80, 60, 60], "time": 0.1}
+    Path("found.json").write_text(json.dumps([found]))
+    given = ("dataset.root=bare", "detect=json", "detect.path=found.json", f"store.root={cache}")
+    assert dzop(*given).status == 0
+    ran = dzop(*given, "step=evaluate")
+    assert ran.status == 1
+    assert "bare/test/000001: found no scene_gt.json, needs ground truth to evaluate against" in ran.err
+
+
+def test_an_oracle_needs_detections_of_ground_truth(dzop, cache):
+    found = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [100, 80, 60, 60], "time": 0.1}
+    Path("found.json").write_text(json.dumps([found]))
+    ran = dzop(f"store.root={cache}", "match=oracle", "detect=json", "detect.path=found.json")
+    assert ran.status == 1
+    assert "match=oracle: found detections without ground truth, needs detect=gt_mask or detect=gt_bbox" in ran.err
 
 
 def test_steps_stop_where_they_are_told(dzop, tmp_path):

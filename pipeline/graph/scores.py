@@ -11,6 +11,7 @@ from functools import cached_property
 from pipeline.bop.results import ResultRow
 from pipeline.digests import files_digest
 from pipeline.graph.context import Context
+from pipeline.graph.plan import Node
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.poses import PoseEstimate
@@ -54,6 +55,12 @@ class ScoreNodes:
             meshes["info"] = info
         inputs = {"poses": self.poses.run_ref().key, "truth": truth_digest(scorer), "depth": depth or scorer.no_vsd}
         return make_ref("scores", recipe, inputs | {"meshes": files_digest(meshes)})
+
+    def node(self) -> Node:
+        """The entry as a plan shows it."""
+        state, targets = self.run.store.state(self.ref), len(self.run.targets)
+        cost = "" if state == "cached" else f"{targets} targets to hold against ground truth"
+        return Node("scores", f"{targets} targets", self.ref, state, self.run.store.size(self.ref) or 0, cost)
 
     def judge(self, answers: Sequence[Answer]) -> Judged:
         """Scores of the run's answers, read or made."""

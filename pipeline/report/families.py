@@ -54,10 +54,10 @@ def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, 
 
 
 def base_of(rows: Sequence[Row]) -> Row:
-    """The run that most others are a step away from; of equals the first."""
+    """The run that most others are a step away from; of equals one that was no job of a sweep, or else the first."""
     asked = [settings(row) for row in rows]
     near = [sum(len(difference(mine, other)) == 1 for other in asked) for mine in asked]
-    return rows[max(range(len(rows)), key=lambda i: (near[i], bool(rows[i].config), -i))]
+    return rows[max(range(len(rows)), key=lambda i: (near[i], bool(rows[i].config), not rows[i].sweep, -i))]
 
 
 def families(rows: Sequence[Row]) -> list[Family]:

@@ -49,8 +49,16 @@ class Shown:
 class Section:
     """Everything about the runs on one set of targets; nothing is compared across sections."""
 
-    rows: Sequence[Row]
+    jobs: Sequence[Row]
     title: str
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """One of the jobs that gave the same scores, such as those that differ in theta_max alone."""
+        kept: dict[tuple[str, str], Row] = {}
+        for row in sorted(self.jobs, key=lambda row: (not row.cases, bool(row.sweep))):
+            kept.setdefault((row.run, row.config.get("variation", "none")), row)
+        return [row for row in self.jobs if row in kept.values()]
 
     @cached_property
     def base(self) -> Row:
@@ -142,7 +150,7 @@ class Section:
             "ablations": [*map(tables.family_table, self.families)],
             "parts": [tables.correspondence_table(self.rows), tables.ladder_table(self.rows)],
             "methods": [tables.improvement_table(self.methods)],
-            "times": [tables.times_table(self.methods), tables.counts_table(self.rows, self.base)],
+            "times": [tables.times_table(self.methods), tables.counts_table(self.jobs, self.base)],
             "failures": [tables.failures_table(self.rows, self.base)],
         }
         return {part: [table for table in made if table is not None] for part, made in by_part.items()}
@@ -268,7 +276,7 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _summary(sections: Sequence[Section], failed: Sequence[Row], folder: Path) -> str:
-    lines = [f"{section.title}: {len(section.rows)} runs; {section.headline()}" for section in sections]
+    lines = [f"{section.title}: {len(section.jobs)} runs; {section.headline()}" for section in sections]
     lines += [f"failed: {' '.join(row.overrides)} ({row.error})" for row in failed]
     lines.append(f"page      {folder / 'index.html'}\nfigures   {folder / 'figures'}\ntables    {folder / 'tables'}")
     return "\n".join(lines)

@@ -59,7 +59,7 @@ def runs_table(rows: Sequence[Row], base: Row) -> Table:
     """Every run that ended well, the best first, and its difference to the base run, paired over images."""
     ordered = sorted(rows, key=lambda row: -ar_interval(_scores(row)).mean)
     without = _scores(base).vsd is None
-    head = ("run", "AR_MSSD+MSPD" if without else "AR", "95 %", "to base", "AR_VSD", "AR_MSSD", "AR_MSPD", "Acc15",
+    head = ("run", "AR_MSSD+MSPD" if without else "AR", "to base", "AR_VSD", "AR_MSSD", "AR_MSPD", "Acc15",
             "template error", "poses", "s/target", "cache/object")  # fmt: skip
     note = " AR_MSSD+MSPD is the mean of the two, not BOP's AR: VSD is not available." if without else ""
     caption = f"Runs; Acc15 and template error geodesic; * more than chance (95 %, paired over images).{note}"
@@ -72,8 +72,7 @@ def _run(row: Row, base: Row) -> tuple[str, ...]:
     angles = template_angles(row, "geodesic")
     return (
         run_name(row, base),
-        _number(spread.mean),
-        f"{_number(spread.low)} to {_number(spread.high)}",
+        f"{_number(spread.mean)} ({_number(spread.low)} to {_number(spread.high)})",
         "base" if row.id == base.id else signed(paired(row, base)),
         *map(_number, recalls),
         _number(acc15(row, "geodesic")),
@@ -230,16 +229,18 @@ def published_tables() -> list[Table]:
 
 
 def run_name(row: Row, base: Row) -> str:
-    """The method, and where a run differs from the base run in what."""
+    """What sets a run apart from the base run; the method's name where that is another."""
     if row.id == base.id or not row.config:
         return row.method
     variation = row.config.get("variation", "none")
     if variation != base.config.get("variation", "none"):
-        return f"{row.method} {variation.replace('_', ' ')}"
+        other = "" if row.method == base.method else f" {row.method}"
+        return f"{variation.replace('_', ' ')}{other}"
     changed = difference(settings(base), settings(row))
     bound = (row.config.get("evaluate") or {}).get("theta_max", 0.5)
     told = [f"{name}={value_text(value)}" for name, value in changed.items()]
-    return " ".join([row.method, *told, *([f"theta_max={bound:g}"] if bound != 0.5 else [])])
+    told += [f"theta_max={bound:g}"] if bound != 0.5 else []
+    return " ".join(([] if row.method == base.method and told else [row.method]) + told)
 
 
 def paired(ours: Row, theirs: Row) -> Interval | None:

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.items.features import Clusters
+from pipeline.items.matches import Correspondences
+from pipeline.items.views import Image
+from pipeline.report.gallery import GAP_PX, LINES_SHOWN, PANEL_PX, Card, draw_card, evenly, paint_clusters, pick_cases
+from pipeline.report.overlay import Drawn
+from pipeline.synthetic.objects import make_object
+
+K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
+
+
+def grey(side: int = 128, value: int = 200) -> np.ndarray:
+    return np.full((side, side, 3), value, np.uint8)
+
+
+def quarters(pairs: list[tuple[int, int]], *, swapped: bool = False) -> Clusters:
+    """Four clusters, the quarters of an 8 x 8 map; in the template left and right may be swapped."""
+    label = torch.tensor([[0, 1], [2, 3]]).repeat_interleave(4, 0).repeat_interleave(4, 1)
+    other = torch.tensor([[1, 0], [3, 2]]).repeat_interleave(4, 0).repeat_interleave(4, 1) if swapped else label
+    return Clusters(label, other, torch.tensor(pairs).reshape(-1, 2))
+
+
+def card(**known) -> Card:
+    rng = np.random.default_rng(0)
+    photo = Image(1, 0, rng.integers(0, 256, (240, 320, 3), dtype=np.uint8), K)
+    return Card(photo, (100.0, 80.0, 180.0, 150.0), [], grey(), **known)
+
+
+def matches(count: int) -> Correspondences:
+    px = torch.rand((count, 2), generator=torch.Generator().manual_seed(0)) * 127
+    return Correspondences(px, px.flip(0), torch.ones(count), torch.zeros(count, dtype=torch.int64))
+
+
+def test_a_pair_of_clusters_has_one_colour_in_both_pictures():
+    clusters = quarters([(0, 0), (1, 1), (2, 2), (3, 3)], swapped=True)
+    query, template = paint_clusters(clusters, grey(), grey())
+    low, high = PANEL_PX // 4, 3 * PANEL_PX // 4
+    for row in (low, high):
+        assert (query[row, low] == template[row, high]).all()
+        assert (query[row, high] == template[row, low]).all()
+    corners = {tuple(query[y, x]) for y in (low, high) for x in (low, high)}
+    assert len(corners) == 4
+
+
+def test_a_cluster_without_a_partner_is_grey():
+    query, _ = paint_clusters(quarters([(0, 0)]), grey(), grey())
+    r, g, b = query[3 * PANEL_PX // 4, 3 * PANEL_PX // 4].tolist()
+    assert r == g == b
+
+
+def test_a_whole_card_has_four_rows_and_a_failure_says_why():
+    clusters = quarters([(0, 0), (1, 1)])
+    known = {"template_rgb": grey(), "clusters": clusters}
+    whole = draw_card(card(**known, matches=matches(200), inliers=np.arange(200) % 2 == 0))
+    assert whole.shape[1] == 2 * PANEL_PX + GAP_PX
+    assert whole.shape[0] > 4 * PANEL_PX
+    early = draw_card(card(reason="match: features are not finite"))
+    assert 2 * PANEL_PX < early.shape[0] < 3 * PANEL_PX
+    assert early.shape[1] == whole.shape[1]
+    longer = draw_card(card(reason="solve: " + "few inliers " * 30))
+    assert longer.shape[0] > early.shape[0]
+
+
+def test_the_same_case_gives_the_same_card():
+    first, second = (draw_card(card(template_rgb=grey(), matches=matches(50), inliers=None)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_not_more_lines_are_drawn_than_an_eye_can_follow():
+    assert len(evenly(5000, LINES_SHOWN)) == LINES_SHOWN
+    assert evenly(3, LINES_SHOWN) == [0, 1, 2]
+    assert evenly(0, LINES_SHOWN) == []
+
+
+def test_inliers_lie_over_outliers_in_another_colour():
+    inliers = np.arange(40) % 2 == 0
+    with_inliers = draw_card(card(template_rgb=grey(), matches=matches(40), inliers=inliers))
+    without = draw_card(card(template_rgb=grey(), matches=matches(40), inliers=None))
+    assert (with_inliers != without).any()
+
+
+@pytest.mark.parametrize("bbox", [(-30.0, -20.0, 20.0, 40.0), (300.0, 200.0, 330.0, 250.0), (0.0, 0.0, 319.0, 239.0)])
+def test_a_detection_at_the_border_is_shown_whole(bbox):
+    photo = Image(1, 0, np.full((240, 320, 3), 255, np.uint8), K)
+    mesh, T = make_object(0), np.eye(4)
+    T[2, 3] = 900.0
+    shown = draw_card(Card(photo, bbox, [Drawn(mesh, T, "correct")], grey()))
+    assert shown.shape[1] == 2 * PANEL_PX + GAP_PX
+
+
+def test_the_best_half_comes_first_and_then_the_worst():
+    errors = [0.5, 0.1, None, 0.3, 0.9, 0.2]
+    assert pick_cases(errors, count=4) == [1, 5, 2, 4]
+    assert pick_cases(errors, count=3) == [1, 5, 2]
+    assert pick_cases(errors, count=99) == [1, 5, 3, 0, 4, 2]
+    assert pick_cases([], count=4) == []
+    assert pick_cases(errors, count=1) == [1]

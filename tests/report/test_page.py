@@ -1,0 +1,129 @@
+import re
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from toy_rows import failed_row, toy_row
+
+from pipeline.errors import BadInput
+from pipeline.report.page import Section, sections_of, write_report
+from pipeline.report.rows import Case, read_rows, write_row
+
+LIMIT_BYTES = 15_000_000
+
+
+def page(rows, out) -> str:
+    return write_report(rows, out).page.read_text()
+
+
+@pytest.fixture
+def rows():
+    return [toy_row(0.5), *(toy_row(0.3 + n / 1000, at=n // 10, cluster__count=n) for n in (40, 80, 130)), failed_row()]
+
+
+def test_a_page_stands_by_itself_and_comes_with_its_figures_and_tables(rows, tmp_path):
+    text = page(rows, tmp_path)
+    assert not re.search(r"""(src|href)=["'](?!data:|#)""", text.replace('xlink:href="#', ""))
+    assert "<script" not in text
+    assert "@import" not in text
+    assert "url(http" not in text
+    figures = {path.suffix for path in (tmp_path / "report" / "figures").rglob("*.*")}
+    assert figures == {".png", ".pdf"}
+    names = {path.name for path in (tmp_path / "report" / "tables").rglob("*.*")}
+    assert {"runs.csv", "runs.tex", "ablation_cluster_count.csv", "published_methods.csv"} <= names
+    assert not list((tmp_path / "report").rglob("*.partial"))
+
+
+def test_the_same_rows_give_the_same_page_but_for_its_date(rows, tmp_path):
+    first, second = (re.sub(r"Written [^<]*by", "", page(rows, tmp_path / name)) for name in "ab")
+    assert first == second
+
+
+def test_a_failed_job_is_told_first(rows, tmp_path):
+    text = page(rows, tmp_path)
+    told = text.index("cluster.count: found -1, needs greater than or equal to 1")
+    assert told < text.index("<main>")
+    assert "cluster.count=-1 sweep=clusters" in text
+
+
+def test_published_numbers_stand_in_tables_of_their_own(rows, tmp_path):
+    text = page(rows, tmp_path)
+    for block in re.findall(r'<figure class="table (measured|published)">(.*?)</figure>', text, flags=re.DOTALL):
+        kind, body = block
+        assert ("published, not measured here" in body) == (kind == "published")
+        assert ("GigaPose" in body) <= (kind == "published")
+    assert text.count("published, LM-O") >= 2  # theta and clusters, below their measured curves
+
+
+def test_what_a_run_says_is_text_and_no_markup(rows, tmp_path):
+    assert "needs 6 &lt;&amp;&gt;" in page(rows, tmp_path)
+
+
+def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
+    other = [toy_row(0.9, key="q" * 64, at=50, instances=21)]
+    found = sections_of([*rows, *other])
+    assert [len(section.rows) for section in found] == [1, 4]
+    assert found[0].title.startswith("demo test: 21 targets")
+    assert found[0].title.endswith("(qqqqqq)")
+    text = page([*rows, *other], tmp_path)
+    assert "nothing is compared across them" in text
+    assert text.count('<section id="d-') == 2
+
+
+def test_runs_that_differ_in_reported_thresholds_alone_are_shown_once(rows):
+    twins = [toy_row(0.5, evaluate__theta_max=bound) for bound in (0.1, 0.2)]
+    section = Section([*rows[:4], *twins], "demo")
+    assert len(section.rows) == 4
+    assert len(section.jobs) == 6
+
+
+def test_a_random_models_notice_cannot_be_missed(rows, tmp_path):
+    noted = replace(rows[0], notice="random weights: nothing was learned")
+    text = page([noted, *rows[1:]], tmp_path)
+    assert text.index("random weights: nothing was learned") < text.index("<table>")
+
+
+def test_missing_vsd_is_told_and_never_a_zero(tmp_path):
+    text = page([toy_row(vsd=False)], tmp_path)
+    assert "VSD, and with it BOP's AR, is not available: no depth" in re.sub(r"&#39;", "'", text)
+    assert ">n/a<" in text
+
+
+def test_rows_of_failures_alone_and_of_a_csv_still_make_a_page(tmp_path):
+    assert "found -1" in page([failed_row()], tmp_path / "a")
+    foreign = replace(toy_row(), config={}, label={}, times_s={}, counts={}, templates={}, method="megapose")
+    text = page([foreign, toy_row()], tmp_path / "b")
+    assert "megapose" in text
+
+
+def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
+    rows = [toy_row(0.5, instances=1000)]
+    rows += [toy_row(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(30)]
+    noise = np.random.default_rng(0).integers(0, 256, (1058, 486, 3), dtype=np.uint8)  # compresses worse than any card
+    folder = tmp_path / rows[0].folder / "gallery"
+    folder.mkdir(parents=True)
+    cases = []
+    for n in range(60):
+        Image.fromarray(np.roll(noise, n, axis=0)).save(folder / f"{n}.jpg", quality=82)
+        cases.append(Case(f"gallery/{n}.jpg", 1, n, 1, 0.1, "score 0.50"))
+    rows[0] = replace(rows[0], cases=tuple(cases))
+    start = time.perf_counter()
+    report = write_report(rows, tmp_path)
+    assert report.page.stat().st_size < LIMIT_BYTES
+    assert time.perf_counter() - start < 60
+    text = report.page.read_text()
+    shown = text.count("data:image/jpeg;base64,")
+    assert 10 < shown < 60
+    assert f"{60 - shown} pictures are not in this page" in text
+
+
+def test_rows_on_disk_make_the_page(rows, tmp_path):
+    for row in rows:
+        write_row(tmp_path, row)
+    report = write_report(read_rows(tmp_path), tmp_path)
+    assert "4 runs; AR" in report.summary
+    assert "failed: cluster.count=-1" in report.summary
+    with pytest.raises(BadInput, match="needs the rows of runs"):
+        read_rows(tmp_path / "empty")

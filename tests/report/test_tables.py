@@ -1,0 +1,114 @@
+import csv
+import io
+
+import pytest
+from toy_rows import toy_row
+
+from pipeline.report import published, tables
+from pipeline.report.families import families
+from pipeline.report.figures import ar_interval
+
+
+def columns(table: tables.Table) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(table.csv())))
+
+
+def test_a_difference_is_paired_and_starred_when_it_is_more_than_chance():
+    base, better, same = toy_row(0.4), toy_row(0.6, cluster__count=40), toy_row(0.4, cluster__count=80)
+    rows = {row["run"]: row for row in columns(tables.runs_table([base, better, same], base))}
+    assert rows["dzop-hog"]["to base"] == "base"
+    assert rows["cluster.count=40"]["to base"].endswith("*")
+    assert rows["cluster.count=80"]["to base"] == "+0.000 (+0.000 to +0.000)"
+    gain = ar_interval(better.scores).mean - ar_interval(base.scores).mean
+    assert rows["cluster.count=40"]["to base"].startswith(f"{gain:+.3f}")
+
+
+def test_without_vsd_the_mean_of_two_is_not_called_ar():
+    row = toy_row(vsd=False)
+    (told,) = columns(tables.runs_table([row], row))
+    assert "AR" not in told
+    assert told["AR_VSD"] == "n/a"
+    assert "AR_MSSD+MSPD" in told
+
+
+def test_runs_on_other_instances_have_no_difference():
+    assert tables.paired(toy_row(), toy_row(instances=21)) is None
+    assert tables.signed(None) == "n/a"
+
+
+def test_the_correspondence_table_has_the_papers_four_rows():
+    concat, one = {"_target_": "pipeline.stages.fuse.concat.Concat"}, {"_target_": "pipeline.stages.cluster.one.One"}
+    rows = [
+        toy_row(0.1, variation="no_coprojection", fuse=concat, correspond__kernel=1),
+        toy_row(0.2, variation="no_clusters", cluster=one, correspond__kernel=1),
+        toy_row(0.3, variation="no_subpixel", correspond__kernel=1),
+        toy_row(0.4),
+        toy_row(0.9, cluster__count=40),
+    ]
+    table = tables.correspondence_table(rows)
+    assert [row[:3] for row in table.rows] == [
+        ("no", "yes", "no"), ("yes", "no", "no"), ("yes", "yes", "no"), ("yes", "yes", "yes"),
+    ]  # fmt: skip
+    assert [row[3] for row in table.rows] == [f"{ar_interval(row.scores).mean:.3f}" for row in rows[:4]]
+    assert tables.correspondence_table([toy_row(), toy_row(cluster__count=40)]) is None
+
+
+def test_the_ladder_says_what_each_rung_gains():
+    oracle = {"_target_": "pipeline.stages.match.oracle.Oracle", "layer": 2, "top_k": 1}
+    rows = [
+        toy_row(0.2),
+        toy_row(0.3, variation="oracle_mask"),
+        toy_row(0.6, variation="oracle_template", match=oracle),
+    ]
+    table = tables.ladder_table(rows)
+    assert [row[0] for row in table.rows] == ["as estimated", "true mask", "true mask, template"]
+    assert table.rows[0][3] == ""
+    assert table.rows[2][3].startswith("+")
+    assert tables.ladder_table(rows[:2]) is None
+
+
+def test_improvements_are_relative_to_the_other_method():
+    ours, theirs = toy_row(0.6), toy_row(0.4, method="zs6d-dino")
+    (row,) = tables.improvement_table([("dzop-hog", ours), ("zs6d-dino", theirs)]).rows
+    assert row[0] == "dzop-hog over zs6d-dino"
+    assert row[1] == "+12.5%"  # 14 degrees instead of 16
+    before, after = (ar_interval(r.scores).mean for r in (theirs, ours))
+    assert row[3] == f"{(after - before) / before:+.1%}"
+    assert tables.improvement_table([("dzop-hog", ours)]) is None
+
+
+def test_jobs_say_what_they_computed_and_what_they_reused():
+    row = toy_row()
+    (told,) = columns(tables.counts_table([row], row))
+    assert told["template features"] == "0 + 900"
+    assert told["query features"] == "n/a"
+
+
+def test_every_csv_row_says_whether_it_was_measured_or_published():
+    for table in tables.published_tables():
+        assert {row["source"] for row in columns(table)} == {"published"}
+    base = toy_row()
+    family = families([base, toy_row(cluster__count=40)])[0]
+    for table in (tables.runs_table([base], base), tables.family_table(family), tables.failures_table([base], base)):
+        assert {row["source"] for row in columns(table)} == {"measured"}
+
+
+def test_latex_escapes_what_it_would_read():
+    table = tables.failures_table([toy_row()], toy_row())
+    assert r"<\&>" in table.latex()
+    assert table.latex().count("&") - table.latex().count(r"\&") == 2 * 3
+    assert r"50\,\%" not in table.latex()
+
+
+@pytest.mark.parametrize(
+    ("dataset", "method", "object_", "value"), [("lmo", "DZOP", 12, 0.550), ("tless", "ZS6D", 30, 0.8750)]
+)
+def test_published_objects_are_those_of_the_paper(dataset, method, object_, value):
+    assert published.OBJECTS[dataset][method][object_] == value
+
+
+def test_published_curves_peak_where_the_paper_says():
+    """200 clusters, dimension 64, 10 correspondences, timestep 50: the paper's own choice."""
+    peaks = {axis: max(points, key=lambda p: p[1])[0] for axis, points in published.ABLATIONS.items()}
+    assert peaks == {"cluster.count": 200, "fuse.dim": 64, "correspond.per_cluster": 10, "extract.timestep": 50}
+    assert [len(values["DZOP"]) for values in published.OBJECTS.values()] == [8, 21, 30]

@@ -1,0 +1,69 @@
+"""Every file of conf/sweep and conf/variation says what it is and composes."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from pipeline.__main__ import stages_of
+from pipeline.report.figures import TITLES
+from pipeline.report.published import ABLATIONS
+
+CONF = Path(__file__).parents[1] / "conf"
+SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
+VARIATIONS = sorted(path.stem for path in (CONF / "variation").glob("*.yaml"))
+
+
+def composed(*overrides: str) -> dict:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", overrides=list(overrides)), resolve=True)
+
+
+def grid(name: str) -> dict[str, str]:
+    return OmegaConf.load(CONF / "sweep" / f"{name}.yaml").hydra.sweeper.params
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_a_sweep_names_itself_and_every_job_of_it_composes(name):
+    assert OmegaConf.load(CONF / "sweep" / f"{name}.yaml").sweep == name
+    overrides = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in grid(name).items()])
+    for override in overrides:
+        for value in override.sweep_string_iterator():
+            config = composed(f"sweep={name}", f"{override.key_or_group}={value}")
+            assert (config["overlays"], config["gallery"], config["sweep"]) == (False, 0, name)
+            stages_of(config)
+
+
+@pytest.mark.parametrize("axis", ABLATIONS)
+def test_the_papers_ablations_run_at_the_papers_points(axis):
+    points = {str(x) for x, _ in ABLATIONS[axis]}
+    swept = next(grid(name)[axis] for name in SWEEPS if axis in grid(name))
+    assert set(str(swept).split(",")) == points
+
+
+@pytest.mark.parametrize("name", VARIATIONS)
+def test_a_variation_names_itself_and_changes_what_it_says(name):
+    plain, config = composed(), composed(f"variation={name}")
+    assert config["variation"] == name
+    expected = {
+        "none": set(),
+        "no_coprojection": {"fuse", "correspond"},
+        "no_clusters": {"cluster", "correspond"},
+        "no_subpixel": {"correspond"},
+        "oracle_mask": set(),
+        "oracle_template": {"match"},
+        "oracle_correspondences": {"match", "correspond"},
+    }[name]
+    assert {key for key in plain if plain[key] != config[key]} - {"variation"} == expected
+
+
+def test_the_command_line_wins_over_a_variation():
+    assert composed("variation=no_subpixel", "correspond.kernel=5")["correspond"]["kernel"] == 5
+    assert composed("variation=oracle_mask", "detect=gt_bbox")["detect"]["_target_"].endswith("GtBbox")
+
+
+def test_every_swept_axis_has_a_title():
+    axes = {key for name in SWEEPS for key in grid(name)} - {"variation", "evaluate.theta_max"}
+    assert axes <= set(TITLES)
