@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -27,6 +25,7 @@ from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
 from pipeline.report.rows import Case, Row, read_row, row_id, row_path, write_row
 from pipeline.report.scores import summary_of
 from pipeline.scoring import dataset_id
+from pipeline.whole import write_json
 
 KEY_DIGITS = 12
 ImageId = tuple[int, int]
@@ -96,7 +95,7 @@ class Outputs:
             "scores": judged and summary_of(judged.scored),
             "answers": told,
         }
-        _write_json(self.folder / "poses.json", record)
+        write_json(self.folder / "poses.json", record)
 
     def places(self, *, overlays: bool) -> str:
         """Lines that say where everything lies."""
@@ -255,10 +254,3 @@ def _template_metrics(judged: Judged, instances: int) -> dict[str, float | None]
         told[f"Acc{ACC_DEG:.0f}_{reading}"] = float((angles < ACC_DEG).sum() / max(instances, 1))
         told[f"template_error_{reading}_deg"] = float(angles.mean()) if len(angles) else None
     return told
-
-
-def _write_json(path: Path, record: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(record, indent=1, allow_nan=False))
-    partial.replace(path)

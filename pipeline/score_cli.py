@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.lint import lint
@@ -23,6 +20,7 @@ from pipeline.report.scores import scores_table, summary_of
 from pipeline.scoring import VSD_DELTA_MM, Scored, Scorer, dataset_id
 from pipeline.spec import digest
 from pipeline.tally import Tally
+from pipeline.whole import write_json
 
 TARGETS = "test_targets_bop19.json"
 FAULTS_SHOWN = 20
@@ -52,7 +50,8 @@ def score_command(arguments: Sequence[str]) -> None:
         print(f"\nmean recall minus that of {theirs.path.name}: {_signed(difference)} (paired over images)")
         record["against"] = {"csv": theirs.path.name, **vars(difference)}
     if asked.json:
-        _write_json(Path(asked.json), record)
+        write_json(Path(asked.json), record)
+        print(f"json      {asked.json}")
     if asked.out:
         print(f"row       {write_row(Path(asked.out), _row(ours, scored))}")
 
@@ -183,11 +182,3 @@ def _row(given: Scoreable, scored: Scored) -> Row:
         metrics=summary_of(scored)["metrics"],
         scores=scored.scores,
     )
-
-
-def _write_json(path: Path, record: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(record, indent=1, allow_nan=False))
-    partial.replace(path)
-    print(f"json      {path}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pipeline.bop.scene import rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.items.poses import PoseEstimate
+from pipeline.whole import write_whole
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _HEADER = ",".join(COLUMNS)
@@ -73,13 +73,7 @@ def rows_of(
 
 def write_results(path: Path, rows: Iterable[ResultRow]) -> None:
     """Write the csv; a reader sees the whole file or none. Numbers are written so that they read back the same."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_bytes("\n".join([_HEADER, *map(_line, rows), ""]).encode("ascii"))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, "\n".join([_HEADER, *map(_line, rows), ""]).encode("ascii"))
 
 
 def read_results(path: Path) -> list[ResultRow]:

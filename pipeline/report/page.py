@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,6 +19,7 @@ from pipeline.report.families import Family, base_of, families
 from pipeline.report.figures import Figure, ar_interval, ar_name
 from pipeline.report.rows import Row
 from pipeline.report.tables import Table, run_name
+from pipeline.whole import write_whole
 
 FOLDER = "report"
 PICTURES_BYTES = 9_000_000
@@ -183,7 +183,7 @@ def write_report(rows: Sequence[Row], out: Path) -> Report:
         left_out=pictures.left_out,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
-    _write_text(folder / "index.html", text)
+    write_whole(folder / "index.html", text)
     return Report(folder / "index.html", _summary(sections, failed, folder))
 
 
@@ -264,15 +264,8 @@ def _once(name: str, names: dict[str, int]) -> str:
 
 def _write_table(folder: Path, table: Table, name: str | None = None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    _write_text(folder / f"{name or table.name}.csv", table.csv())
-    _write_text(folder / f"{name or table.name}.tex", table.latex())
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    write_whole(folder / f"{name or table.name}.csv", table.csv())
+    write_whole(folder / f"{name or table.name}.tex", table.latex())
 
 
 def _summary(sections: Sequence[Section], failed: Sequence[Row], folder: Path) -> str:

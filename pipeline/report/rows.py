@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, Literal
 from pipeline.errors import BadInput
 from pipeline.items.scores import DatasetId, Scores, TemplateError, scores_of, scores_record
 from pipeline.spec import digest
+from pipeline.whole import write_json
 
 FORMAT = 1
 FOLDER = "rows"
@@ -81,10 +81,7 @@ def row_path(out: Path, id_: str) -> Path:
 def write_row(out: Path, row: Row) -> Path:
     """Write a row; a reader sees the whole file or none."""
     path = row_path(out, row.id)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps({"format": FORMAT, **_record(row)}, allow_nan=False))
-    partial.replace(path)
+    write_json(path, {"format": FORMAT, **_record(row)})
     return path
 
 
