@@ -18,13 +18,21 @@ def page(rows, out) -> str:
     return write_report(rows, out).page.read_text()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def rows():
     return [toy_row(0.5), *(toy_row(0.3 + n / 1000, at=n // 10, cluster__count=n) for n in (40, 80, 130)), failed_row()]
 
 
-def test_a_page_stands_by_itself_and_comes_with_its_figures_and_tables(rows, tmp_path):
-    text = page(rows, tmp_path)
+@pytest.fixture(scope="module")
+def built(rows, tmp_path_factory):
+    """The results folder of a page that several tests look at, and its text."""
+    out = tmp_path_factory.mktemp("results")
+    noted = replace(rows[0], notice="random weights: nothing was learned")
+    return out, page([noted, *rows[1:]], out)
+
+
+def test_a_page_stands_by_itself_and_comes_with_its_figures_and_tables(built):
+    tmp_path, text = built
     assert not re.search(r"""(src|href)=["'](?!data:|#)""", text.replace('xlink:href="#', ""))
     assert "<script" not in text
     assert "@import" not in text
@@ -37,19 +45,19 @@ def test_a_page_stands_by_itself_and_comes_with_its_figures_and_tables(rows, tmp
 
 
 def test_the_same_rows_give_the_same_page_but_for_its_date(rows, tmp_path):
-    first, second = (re.sub(r"Written [^<]*by", "", page(rows, tmp_path / name)) for name in "ab")
+    first, second = (re.sub(r"Written [^<]*by", "", page(rows[:2], tmp_path / name)) for name in "ab")
     assert first == second
 
 
-def test_a_failed_job_is_told_first(rows, tmp_path):
-    text = page(rows, tmp_path)
+def test_a_failed_job_is_told_first(built):
+    _, text = built
     told = text.index("cluster.count: found -1, needs greater than or equal to 1")
     assert told < text.index("<main>")
     assert "cluster.count=-1 sweep=clusters" in text
 
 
-def test_published_numbers_stand_in_tables_of_their_own(rows, tmp_path):
-    text = page(rows, tmp_path)
+def test_published_numbers_stand_in_tables_of_their_own(built):
+    _, text = built
     for block in re.findall(r'<figure class="table (measured|published)">(.*?)</figure>', text, flags=re.DOTALL):
         kind, body = block
         assert ("published, not measured here" in body) == (kind == "published")
@@ -57,8 +65,8 @@ def test_published_numbers_stand_in_tables_of_their_own(rows, tmp_path):
     assert text.count("published, LM-O") >= 2  # theta and clusters, below their measured curves
 
 
-def test_what_a_run_says_is_text_and_no_markup(rows, tmp_path):
-    assert "needs 6 &lt;&amp;&gt;" in page(rows, tmp_path)
+def test_what_a_run_says_is_text_and_no_markup(built):
+    assert "needs 6 &lt;&amp;&gt;" in built[1]
 
 
 def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
@@ -67,7 +75,7 @@ def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
     assert [len(section.rows) for section in found] == [1, 4]
     assert found[0].title.startswith("demo test: 21 targets")
     assert found[0].title.endswith("(qqqqqq)")
-    text = page([*rows, *other], tmp_path)
+    text = page([rows[0], *other], tmp_path)
     assert "nothing is compared across them" in text
     assert text.count('<section id="d-') == 2
 
@@ -79,9 +87,8 @@ def test_runs_that_differ_in_reported_thresholds_alone_are_shown_once(rows):
     assert len(section.jobs) == 6
 
 
-def test_a_random_models_notice_cannot_be_missed(rows, tmp_path):
-    noted = replace(rows[0], notice="random weights: nothing was learned")
-    text = page([noted, *rows[1:]], tmp_path)
+def test_a_random_models_notice_cannot_be_missed(built):
+    _, text = built
     assert text.index("random weights: nothing was learned") < text.index("<table>")
 
 
@@ -100,7 +107,7 @@ def test_rows_of_failures_alone_and_of_a_csv_still_make_a_page(tmp_path):
 
 def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
     rows = [toy_row(0.5, instances=1000)]
-    rows += [toy_row(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(30)]
+    rows += [toy_row(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(20)]
     noise = np.random.default_rng(0).integers(0, 256, (1058, 486, 3), dtype=np.uint8)  # compresses worse than any card
     folder = tmp_path / rows[0].folder / "gallery"
     folder.mkdir(parents=True)
@@ -120,10 +127,10 @@ def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
 
 
 def test_rows_on_disk_make_the_page(rows, tmp_path):
-    for row in rows:
+    for row in (rows[0], rows[-1]):
         write_row(tmp_path, row)
     report = write_report(read_rows(tmp_path), tmp_path)
-    assert "4 runs; AR" in report.summary
+    assert "1 runs; AR" in report.summary
     assert "failed: cluster.count=-1" in report.summary
     with pytest.raises(BadInput, match="needs the rows of runs"):
         read_rows(tmp_path / "empty")
