@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.bop.results import results_name, rows_of, write_results
-from pipeline.errors import BadInput
 from pipeline.graph import Graph, Judged, Retraced, ScoreNodes
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, record_of
@@ -22,7 +21,7 @@ from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, error
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.report.gallery import Card, draw_card, pick_cases
 from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
-from pipeline.report.rows import Case, Row, read_row, row_id, row_path, write_row
+from pipeline.report.rows import Case, Row, done_row, row_id, row_path, write_row
 from pipeline.report.scores import summary_of
 from pipeline.scoring import dataset_id
 from pipeline.whole import write_json
@@ -72,13 +71,13 @@ class Outputs:
 
     def finished(self) -> bool:
         """Whether an earlier run of the same configuration, on the same inputs, has left all its files."""
-        if self.scores is None or not self.row_path.exists():
-            return False
-        try:
-            row = read_row(self.row_path)
-        except BadInput:
-            return False
-        return row.status == "done" and row.run == self.scores.ref.key and (self.out / row.folder / row.csv).exists()
+        row = self._row_before()
+        return row is not None and (self.out / row.folder / row.csv).exists()
+
+    def _row_before(self) -> Row | None:
+        """The row that an earlier run of the same configuration on the same inputs has left, if it ended well."""
+        row = done_row(self.out, row_id(self.config))
+        return row if row and self.scores and row.run == self.scores.ref.key else None
 
     def write_files(self, answers: Sequence[Answer], judged: Judged | None) -> None:
         """The csv and poses.json."""
@@ -207,6 +206,9 @@ class Outputs:
             templates=judged.templates,
             cases=tuple(cases),
         )
+        before = self._row_before()
+        if before is not None:  # what was computed is what the first run computed
+            row = replace(row, at=before.at, counts=before.counts, sweep=before.sweep)
         print(f"row       {write_row(self.out, row)}")
 
 

@@ -20,7 +20,7 @@ from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Target
 from pipeline.outputs import KEY_DIGITS, Outputs, now
-from pipeline.report.rows import Row, read_row, read_rows, row_id, row_path, write_row
+from pipeline.report.rows import Row, done_row, read_rows, row_id, write_row
 from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
 from pipeline.route import Stages
@@ -210,7 +210,7 @@ def plan_table(nodes: Sequence[Node]) -> str:
 def note_failure(out: str, config: Mapping[str, Any], overrides: Sequence[str], message: str) -> None:
     """Leave a row that says that a job failed and why, unless the same configuration has ended well before."""
     id_ = row_id(config)
-    if row_path(Path(out), id_).exists() and read_row(row_path(Path(out), id_)).status == "done":
+    if done_row(Path(out), id_) is not None:
         return
     row = Row(
         id=id_,

@@ -136,6 +136,10 @@ def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, sc
     same = json.loads(Path("scored.json").read_text())["metrics"]
     assert {name: same[name] for name in told} == pytest.approx(told)
     assert row.metrics["AR"] == pytest.approx(same["AR"])
+    dzop(f"store.root={cache}", "gallery=3")
+    (again,) = read_rows(tmp_path / "results")
+    assert (again.at, again.counts) == (row.at, row.counts)  # the row says what the first run computed
+    assert len(again.cases) == 3
     assert same["AR_VSD"] is not None
 
 

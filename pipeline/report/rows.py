@@ -97,6 +97,15 @@ def read_row(path: Path) -> Row:
         raise BadInput(path, found=found, needed="a row that a run has written; remove the file") from None
 
 
+def done_row(out: Path, id_: str) -> Row | None:
+    """The row of a run that ended well; None where there is none, or none that can be read."""
+    try:
+        row = read_row(row_path(out, id_))
+    except BadInput:
+        return None
+    return row if row.status == "done" else None
+
+
 def read_rows(out: Path) -> list[Row]:
     """All rows below ``out``, oldest first. Raises BadInput for a broken one and where there is none."""
     paths = sorted((out / FOLDER).glob("*.json"))
