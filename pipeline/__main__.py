@@ -7,11 +7,13 @@ and ``dzop lint ...`` take results files.
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import tempfile
+import time
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import hydra
@@ -28,6 +30,7 @@ from pipeline.run import Evaluate, Options, Select, make_report, note_failure, r
 from pipeline.score_cli import lint_command, score_command
 from pipeline.spec import Runtime, build
 from pipeline.store import Store
+from pipeline.whole import write_whole
 
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "detect")
 PACKAGE = Path(__file__).resolve().parent
@@ -44,11 +47,12 @@ def main() -> None:
         if sys.argv[1:2] and sys.argv[1] in COMMANDS:
             COMMANDS[sys.argv[1]](sys.argv[2:])
             return
-        with TemporaryDirectory(prefix="dzop-") as folder:
-            os.environ[FAILED] = folder
-            _hydra_main()
-            failed = [path.read_text() for path in sorted(Path(folder).iterdir())]
-        if failed:
+        folder = Path(tempfile.gettempdir()) / f"dzop-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
+        os.environ[FAILED] = str(folder)
+        _hydra_main()
+        if folder.is_dir():
+            failed = [path.read_text() for path in sorted(folder.iterdir())]
+            shutil.rmtree(folder)
             sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {'; '.join(failed)}")
     except (DzopError, HydraException, OmegaConfBaseException) as error:
         sys.exit(_told(error))
@@ -88,7 +92,7 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
-    (Path(os.environ[FAILED]) / f"{number:06d}").write_text(f"{' '.join(overrides)} ({message})")
+    write_whole(Path(os.environ[FAILED]) / f"{number:06d}", f"{' '.join(overrides)} ({message})")
     values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
     note_failure(values["out"], values, overrides, message)
 
