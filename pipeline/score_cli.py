@@ -97,6 +97,8 @@ def _dataset_options(parser: argparse.ArgumentParser, *, required: bool) -> None
 
 def _opened(asked: argparse.Namespace, path: Path) -> Scoreable:
     rows = read_results(path)
+    if not rows:
+        raise BadInput(path, found="no estimate", needed="rows of scene_id,im_id,obj_id,score,R,t,time")
     data = _open_dataset(asked, path, models=asked.models)
     kept = _known(path, rows, data, subset=asked.subset)
     delta = VSD_DELTA_MM.get(data.name, 15.0)

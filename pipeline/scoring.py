@@ -7,7 +7,7 @@ visible. Estimates of anything that is not a target are left out.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -105,14 +105,21 @@ class Scorer:
         found: list[tuple[Target, _Found]] = []
         for image in self.images:
             view = _View(self, image, None if self.no_vsd else self.dataset.depth_mm(*image))
-            for target in by_image[image]:
-                truths = self.truths(target)
-                mine = estimates[target.scene_id, target.im_id, target.obj_id]
-                best = [mine[i] for i in best_scored([rows[i].score for i in mine], target.inst_count)]
-                counted = self.counted(target)
-                found.append((target, _find(view, truths, counted, [(index, rows[index]) for index in best])))
+            with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # poses may be anywhere
+                found += [(target, self._find(view, target, rows, estimates)) for target in by_image[image]]
             progress(1)
         return Scored(tuple(e for _, f in found for e in f.errors), self._scores(found))
+
+    def _find(
+        self,
+        view: _View,
+        target: Target,
+        rows: Sequence[ResultRow],
+        estimates: Mapping[tuple[int, int, int], list[int]],
+    ) -> _Found:
+        mine = estimates.get((target.scene_id, target.im_id, target.obj_id), [])
+        best = [mine[i] for i in best_scored([rows[i].score for i in mine], target.inst_count)]
+        return _find(view, self.truths(target), self.counted(target), [(index, rows[index]) for index in best])
 
     def truths(self, target: Target) -> list[GroundTruth]:
         """All annotated instances of a target's object in its image."""

@@ -95,6 +95,16 @@ def test_a_difference_to_another_csv_is_paired(dzop):
     assert -1 < against["low"] <= against["mean"] <= against["high"] < 0
 
 
+@pytest.mark.parametrize("t", [(1e300, 0, 1e300), (0, 0, 0), (0, 0, -500), (1e9, 0, 1e-9)])
+def test_a_pose_anywhere_is_a_miss_and_no_warning(dzop, t, recwarn):
+    rows = true_rows(Path("tiny"))
+    odd = [ResultRow(r.scene_id, r.im_id, r.obj_id, 1.0, rigid(np.eye(3), np.array(t, float)), 0.5) for r in rows]
+    write_results(Path("odd_tiny-test.csv"), odd)
+    told = figures(dzop, "odd_tiny-test.csv")["metrics"]
+    assert (told["AR_MSSD"], told["AR_MSPD"], told["recall_ADI"]) == (0.0, 0.0, 0.0)
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+
+
 def test_a_row_for_the_report_keeps_the_scores(dzop):
     write_results(Path("other_tiny-test.csv"), true_rows(Path("tiny")))
     assert dzop("score", "other_tiny-test.csv", "--dataset", "tiny", "--out", "results").status == 0
@@ -122,6 +132,7 @@ def test_rows_of_another_dataset_are_refused_and_a_subset_must_be_asked_for(dzop
         (("score", "gt_tiny-test.csv", "--dataset", "tiny", "--targets", "o.json"), "o.json: found no such file"),
         (("score", "gt_tiny-test.csv", "--dataset", "tiny", "--models", "cad"), "needs the folder of object models"),
         (("score", "nan_tiny-test.csv", "--dataset", "tiny"), "nan_tiny-test.csv, line 2, field R"),
+        (("score", "header_tiny-test.csv", "--dataset", "tiny"), "header_tiny-test.csv: found no estimate"),
         (("lint", "absent.csv"), "absent.csv: found no such file"),
     ],
 )  # fmt: skip
@@ -129,6 +140,7 @@ def test_bad_input_is_one_line(dzop, arguments, told):
     write_results(Path("gt_tiny-test.csv"), true_rows(Path("tiny")))
     text = Path("gt_tiny-test.csv").read_text()
     Path("nan_tiny-test.csv").write_text(text.replace("1.0 0.0 0.0 0.0", "nan 0.0 0.0 0.0", 1))
+    Path("header_tiny-test.csv").write_text(text.splitlines()[0])
     ran = dzop(*arguments)
     assert ran.status == 1
     assert told in ran.err

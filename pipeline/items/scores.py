@@ -119,15 +119,17 @@ def scores_of(record: Mapping[str, Any]) -> Scores:
     """The scores a record holds."""
     scene_id, im_id, obj_id, gt_id = np.array(record["instances"], dtype=np.int64).reshape(-1, 4).T
     visible = np.array([np.nan if v is None else v for v in record["visib_fract"]], dtype=np.float64)
+    if not {len(record[name]) for name in ("visib_fract", "mssd", "mspd")} <= {len(scene_id)}:
+        raise ValueError("scores of another number of instances")
     mssd, mspd = _bits(record["mssd"], 10), _bits(record["mspd"], 10)
-    vsd = None if record["vsd"] is None else _bits(record["vsd"], 100).reshape(-1, 10, 10)
+    vsd = None if record["vsd"] is None else _bits(record["vsd"], 100).reshape(len(scene_id), 10, 10)
     return Scores(scene_id, im_id, obj_id, gt_id, visible, mssd, mspd, vsd, record["no_vsd"])
 
 
 def errors_record(errors: PoseErrors) -> dict[str, Any]:
     """JSON-able; what is infinitely far becomes null."""
     values = asdict(errors) | {"vsd": None if errors.vsd is None else list(errors.vsd)}
-    return {name: None if value == np.inf else value for name, value in values.items()}
+    return {n: None if isinstance(v, float) and not np.isfinite(v) else v for n, v in values.items()}
 
 
 def errors_of(record: Mapping[str, Any]) -> PoseErrors:

@@ -88,7 +88,9 @@ def error_recalls(scored: Scored) -> dict[str, float | None]:
     if nearest:
         medians["median_rotation_deg"] = float(np.median([e.symmetric_rotation_deg for e in nearest]))
         medians["median_translation_mm"] = float(np.median([e.translation_mm for e in nearest]))
-    return {**found, **medians}
+    return found | {
+        name: value if value is not None and np.isfinite(value) else None for name, value in medians.items()
+    }
 
 
 def _nearest(scored: Scored) -> list[PoseErrors]:
@@ -110,7 +112,7 @@ def _line(name: str, recall: AverageRecall, remark: str) -> str:
 def _errors_line(scored: Scored) -> str:
     values = error_recalls(scored)
     line = f"ADD < 0.1 diameters: {values['recall_ADD']:.4f}, ADI: {values['recall_ADI']:.4f} of the instances"
-    if values["median_rotation_deg"] is None:
+    if values["median_rotation_deg"] is None or values["median_translation_mm"] is None:
         return line
     rotation, shift = values["median_rotation_deg"], values["median_translation_mm"]
     return f"{line}; medians over estimates: {rotation:.1f} degrees (symmetry-aware), {shift:.0f} mm"
