@@ -126,7 +126,8 @@ class Outputs:
             return []
         start, drawn, cases = time.perf_counter(), 0, []
         retrace, errors = self.graph.retracer(), _errors(answers, judged)
-        chosen = pick_cases([None if e is None else e.relative_mssd for e in errors], count=count)
+        relative = [None if e is None else e.relative_mssd for e in errors]
+        chosen = pick_cases(relative, count=count, obj_ids=[a.obj_id for a in answers])
         with self.graph.run.tally.bar(len(chosen), "gallery", "picture") as advance:
             for index in sorted(chosen, key=lambda i: answers[i].obj_id):
                 answer = answers[index]

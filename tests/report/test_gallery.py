@@ -5,7 +5,19 @@ import torch
 from pipeline.items.features import Clusters
 from pipeline.items.matches import Correspondences
 from pipeline.items.views import Image
-from pipeline.report.gallery import GAP_PX, LINES_SHOWN, PANEL_PX, Card, draw_card, evenly, paint_clusters, pick_cases
+from pipeline.report.gallery import (
+    GAP_PX,
+    INLIER,
+    LINES_SHOWN,
+    OUTLIER,
+    PANEL_PX,
+    TITLE_PX,
+    Card,
+    draw_card,
+    evenly,
+    paint_clusters,
+    pick_cases,
+)
 from pipeline.report.overlay import Drawn
 from pipeline.synthetic.objects import make_object
 
@@ -75,11 +87,33 @@ def test_not_more_lines_are_drawn_than_an_eye_can_follow():
     assert evenly(0, LINES_SHOWN) == []
 
 
-def test_inliers_lie_over_outliers_in_another_colour():
-    inliers = np.arange(40) % 2 == 0
-    with_inliers = draw_card(card(template_rgb=grey(), matches=matches(40), inliers=inliers))
-    without = draw_card(card(template_rgb=grey(), matches=matches(40), inliers=None))
-    assert (with_inliers != without).any()
+def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((np.abs(picture.astype(int) - colour).max(axis=-1) < 12).any())
+
+
+@pytest.mark.parametrize(
+    ("inliers", "shown"),
+    [(np.ones(40, bool), (True, False)), (np.zeros(40, bool), (False, True)), (None, (False, False))],
+)
+def test_inliers_and_outliers_have_their_colours_and_neither_where_no_pose_was_solved(inliers, shown):
+    lines = draw_card(card(template_rgb=grey(), matches=matches(40), inliers=inliers))[PANEL_PX + TITLE_PX :]
+    lines = lines[: -PANEL_PX - TITLE_PX]
+    assert (has(lines, INLIER), has(lines, OUTLIER)) == shown
+
+
+def test_inliers_lie_over_outliers():
+    px = torch.tensor([[64.0, 64.0]]).repeat(2, 1)
+    same = Correspondences(px, px, torch.ones(2), torch.zeros(2, dtype=torch.int64))
+    for inliers in ([True, False], [False, True]):
+        lines = draw_card(card(template_rgb=grey(), matches=same, inliers=np.array(inliers)))[:-PANEL_PX]
+        assert has(lines, INLIER)
+        assert not has(lines, OUTLIER)
+
+
+def test_the_photograph_is_shown_without_black_beyond_its_border():
+    white = Image(1, 0, np.full((240, 320, 3), 255, np.uint8), K)
+    shown = draw_card(Card(white, (280.0, 190.0, 319.5, 239.5), [], grey()))
+    assert (shown[-PANEL_PX:] == 255).all()
 
 
 @pytest.mark.parametrize("bbox", [(-30.0, -20.0, 20.0, 40.0), (300.0, 200.0, 330.0, 250.0), (0.0, 0.0, 319.0, 239.0)])
@@ -98,3 +132,14 @@ def test_the_best_half_comes_first_and_then_the_worst():
     assert pick_cases(errors, count=99) == [1, 5, 3, 0, 4, 2]
     assert pick_cases([], count=4) == []
     assert pick_cases(errors, count=1) == [1]
+
+
+def test_objects_take_turns_and_each_half_keeps_its_order():
+    errors, obj_ids = [0.1, 0.2, 0.3, 0.6, 0.9, 0.8], [1, 1, 1, 2, 2, 2]
+    assert pick_cases(errors, count=4) == [0, 1, 4, 5]
+    assert pick_cases(errors, count=4, obj_ids=obj_ids) == [0, 3, 4, 2]
+    assert sorted(pick_cases(errors, count=6, obj_ids=obj_ids)) == list(range(6))
+
+
+def test_without_any_error_the_first_answers_are_shown():
+    assert pick_cases([None] * 9, count=3) == [0, 1, 2]
