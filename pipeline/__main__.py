@@ -6,6 +6,8 @@ and ``dzop lint ...`` take results files.
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 import shutil
 import sys
@@ -13,6 +15,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Mapping
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, cast
 
@@ -38,33 +41,44 @@ CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if 
 COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
 FAILED = "DZOP_FAILED_JOBS"
 """Environment variable: folder where a sweep's jobs, in whatever process a launcher runs them, leave their errors."""
+KILLED = "a process of the sweep was killed, often for want of memory; the same command goes on where it stopped"
 
 
 def main() -> None:
     """Run, and turn whatever a user can mend into one line on stderr and exit status 1."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing a paragraph; the line below is the message
+    logging.raiseExceptions = False  # Hydra's log of a sweep's jobs has no more to say once its reader has left
     try:
         if sys.argv[1:2] and sys.argv[1] in COMMANDS:
             COMMANDS[sys.argv[1]](sys.argv[2:])
-            return
-        folder = Path(tempfile.gettempdir()) / f"dzop-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
-        os.environ[FAILED] = str(folder)
-        _hydra_main()
-        if folder.is_dir():
-            failed = [path.read_text() for path in sorted(folder.iterdir())]
-            shutil.rmtree(folder)
-            sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {'; '.join(failed)}")
+        else:
+            _run_jobs()
     except (DzopError, HydraException, OmegaConfBaseException) as error:
         sys.exit(_told(error))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of a pipe has left: not a fault
         sys.exit(1)
+    except BrokenExecutor:
+        sys.exit(f"error: {KILLED}")
     except OSError as error:
         if error.filename is None:
             raise
         sys.exit(f"error: {error.filename}: {error.strerror}")
     except KeyboardInterrupt:
         sys.exit("interrupted: what was complete is kept, and the next run goes on from there")
+
+
+def _run_jobs() -> None:
+    """The run, or all jobs of a sweep, and then in one line those that failed."""
+    folder = Path(tempfile.gettempdir()) / f"dzop-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
+    os.environ[FAILED] = str(folder)
+    try:
+        _hydra_main()
+        failed = [path.read_text() for path in sorted(folder.glob("*"))]
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    if failed:
+        sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {'; '.join(failed)}")
 
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
@@ -76,6 +90,8 @@ def _hydra_main(config: DictConfig) -> None:
         _give_up(config, BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
     except DzopError as error:
         _give_up(config, error)
+    except BrokenPipeError:
+        raise  # the reader has left: no job's fault
     except Exception as error:
         if not sweeping:
             raise
@@ -93,8 +109,17 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
     write_whole(Path(os.environ[FAILED]) / f"{number:06d}", f"{' '.join(overrides)} ({message})")
-    values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    values = cast(dict[str, Any], _writable(OmegaConf.to_container(config, resolve=True)))
     note_failure(values["out"], values, overrides, message)
+
+
+def _writable(value: Any) -> Any:
+    """A configuration as JSON can hold it: numbers that are none, often what made the job fail, as text."""
+    if isinstance(value, dict):
+        return {str(name): _writable(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_writable(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _job(config: DictConfig, *, sweeping: bool) -> None:

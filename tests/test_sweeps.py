@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from pipeline.report.rows import read_rows
@@ -63,6 +64,49 @@ def test_a_failed_job_loses_no_other_and_is_listed_at_the_end_and_in_the_rows(co
     assert page.returncode == 0, page.stderr
     assert "cluster.count=-1 solve.min_inliers=4 (cluster.count: found -1" in page.stdout
     assert "cluster.count: found -1" in (tmp_path / "results" / "report" / "index.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_value_that_is_no_number_fails_its_job_alone(command, tmp_path):
+    done = ran(command("-m", "solve.threshold_px=nan,8"))
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("error: 1 of the sweep's jobs failed: ")
+    rows = {row.status: row.config["solve"]["threshold_px"] for row in read_rows(tmp_path / "results")}
+    assert rows == {"failed": "nan", "done": 8}
+
+
+@pytest.mark.slow
+def test_a_reader_that_leaves_makes_no_job_fail(command, tmp_path):
+    jobs = subprocess.Popen(
+        command("-m", "cluster.count=3,4"), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    jobs.stdout.close()
+    _, told = jobs.communicate(timeout=300)
+    assert "jobs failed" not in told.decode()
+    assert not list(tmp_path.glob("results/rows/*.json"))
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_told_in_one_line_and_the_sweep_goes_on_with_the_same_command(command, tmp_path):
+    jobs = command("-m", "cluster.count=3,4,5,6,7,8,9,10", *JOBLIB)
+    rows = tmp_path / "results" / "rows"
+    sweep = subprocess.Popen(jobs, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    limit = time.monotonic() + 120
+    while not list(rows.glob("*.json")) and time.monotonic() < limit:
+        time.sleep(0.01)
+    workers = [p for p in psutil.Process(sweep.pid).children() if any("popen_loky" in word for word in p.cmdline())]
+    workers[0].kill()
+    _, told = sweep.communicate(timeout=300)
+    assert sweep.returncode == 1
+    assert "Traceback" not in told
+    # the workers' own watcher may have the last word
+    assert any(line.startswith("error: a process of the sweep was killed") for line in told.splitlines())
+    finished = len(list(rows.glob("*.json")))
+    again = ran(jobs)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.count("finished before: ") == finished
+    assert len(list(rows.glob("*.json"))) == 8
 
 
 @pytest.mark.slow
