@@ -8,8 +8,11 @@ from pathlib import Path
 
 import torch
 
+from pipeline.embedded.export import export
 from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
 from pipeline.embedded.views import make_shard
+
+WEIGHTS = Path(__file__).parent / "weights"
 
 
 def main() -> None:
@@ -32,8 +35,9 @@ def run(options: argparse.Namespace) -> None:
     for kind, steps in ((Autoencoder, plan.autoencoder), (Denoiser, plan.denoiser), (Descriptors, plan.descriptors)):
         if not train(kind(plan, place, round(steps * options.scale)), place, until=until):
             print(f"{kind.name}: time is up; the next call goes on from here")
-            return
+            break
         print(f"{kind.name}: done")
+    print(f"{export(place, WEIGHTS) / 1e6:.1f} MB of weights in {WEIGHTS}")
 
 
 if __name__ == "__main__":

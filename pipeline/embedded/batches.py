@@ -140,9 +140,7 @@ def _object_points(view: View, px: np.ndarray) -> Float[np.ndarray, "m 3"]:
     return (points - T[:3, 3]) @ T[:3, :3]
 
 
-def _seen_in(
-    view: View, points: Float[np.ndarray, "m 3"]
-) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, " m"]]:
+def _seen_in(view: View, points: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, " m"]]:
     """Pixels of object points in a view, and whether nothing hides them there."""
     T, K = view.T.astype(np.float64), view.K.astype(np.float64)
     in_camera = points @ T[:3, :3].T + T[:3, 3]

@@ -24,7 +24,9 @@ def reconstruction_loss(
     return error.abs().mean() + slope + 1e-4 * prior
 
 
-def sides(maps: Float[Tensor, "n c h w"], batch: PairBatch) -> tuple[Float[Tensor, "b q c h w"], Float[Tensor, "b t c h w"]]:
+def sides(
+    maps: Float[Tensor, "n c h w"], batch: PairBatch
+) -> tuple[Float[Tensor, "b q c h w"], Float[Tensor, "b t c h w"]]:
     """Maps of queries and of templates, by cluster."""
     b, q, t = batch.angle_deg.shape
     by_cluster = maps.unflatten(0, (b, q + t))
@@ -71,7 +73,9 @@ def retrieval_scores(maps: Float[Tensor, "n c h w"], batch: PairBatch) -> Float[
     return (cosine * both).sum((-2, -1)) / either.sum((-2, -1)).clamp(min=1)
 
 
-def retrieval_loss(scores: Float[Tensor, "b q t"], angle_deg: Float[Tensor, "b q t"], scale: Tensor) -> Float[Tensor, ""]:
+def retrieval_loss(
+    scores: Float[Tensor, "b q t"], angle_deg: Float[Tensor, "b q t"], scale: Tensor
+) -> Float[Tensor, ""]:
     """Cross entropy over an object's templates, against weights that fall with the angle to the query's view."""
     target = torch.softmax(-0.5 * (angle_deg / _NEAR_DEG) ** 2, dim=-1)
     return -(target * (scores * scale).log_softmax(-1)).sum(-1).mean()

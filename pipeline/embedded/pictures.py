@@ -35,7 +35,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A crop as the extractor gets it. ``seen``: pixels of the view that it truly shows; A_crop_view takes them to it."""
+    """A crop as the extractor gets it. ``seen``: pixels of the view that it shows; A_crop_view takes them there."""
 
     rgb: UInt8[np.ndarray, "S S 3"]
     mask: Bool[np.ndarray, "S S"]
@@ -82,7 +82,7 @@ def _relit(view: View, rng: Rng) -> Float32[np.ndarray, "S S 3"]:
     for strength in (diffuse, rng.choice([0.0, rng.uniform(0, 0.5)])):
         toward = rng.normal(size=3) * [1, 1, 0.6] + [0, -0.6, -0.9]
         toward /= np.linalg.norm(toward)
-        half = toward + [0, 0, -1.0]
+        half = toward - np.array([0.0, 0.0, 1.0])
         shade = shade + strength * np.maximum(view.normal @ toward.astype(np.float32), 0)
         lobe = np.maximum(view.normal @ (half / np.linalg.norm(half)).astype(np.float32), 0)
         shine = shine + strength * lobe ** rng.uniform(8, 50)

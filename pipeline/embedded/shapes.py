@@ -1,4 +1,4 @@
-"""seed -> an object to train on: assemblies of turned, extruded, bent, bumpy and box-like parts, mostly plainly coloured.
+"""seed -> an object to train on: assemblies of turned, extruded, bent, bumpy, box-like parts, mostly of plain colour.
 
 Wider than ``synthetic.objects``, whose objects the benchmark uses: symmetric ones, hollow ones and thin ones are among
 these, and so are objects of a single colour.

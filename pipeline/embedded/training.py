@@ -89,7 +89,7 @@ class Stage(ABC):
     def __init__(self, plan: Plan, place: Place, steps: int) -> None:
         self.plan, self.steps, self.source = plan, steps, place.source(plan)
         torch.manual_seed(plan.seed)
-        self.model = self.build(place).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.model = self.build(place).to(memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
 
     @abstractmethod
@@ -126,10 +126,12 @@ class Autoencoder(Stage):
         """Reconstruction of 16 pictures."""
         image = network_image(picture_batch(self.source, step, count=16), size=128)
         with _mixed():
-            posterior = self.model.encode(image).latent_dist  # type: ignore[operator]
+            posterior = self.model.encode(image).latent_dist
             generator = torch.Generator().manual_seed(step)
-            made = self.model.decode(posterior.sample(generator)).sample  # type: ignore[operator]
-        return {"loss": losses.reconstruction_loss(made.float(), image, posterior.mean.float(), posterior.logvar.float())}
+            made = self.model.decode(posterior.sample(generator)).sample
+        return {
+            "loss": losses.reconstruction_loss(made.float(), image, posterior.mean.float(), posterior.logvar.float())
+        }
 
 
 class Denoiser(Stage):
@@ -207,7 +209,7 @@ class Latents:
 
     def __init__(self, place: Place) -> None:
         saved = torch.load(place.checkpoint("autoencoder"), weights_only=True)
-        self.vae = untrained(UNET, VAE)[1].to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.vae = untrained(UNET, VAE)[1].to(memory_format=torch.channels_last)
         self.vae.load_state_dict(saved["average"])
         self.vae.eval().requires_grad_(False)
         self.config = VAE | {"scaling_factor": saved["scaling_factor"]}
@@ -281,7 +283,7 @@ def _save(stage: Stage, optimiser: torch.optim.Optimizer, step: int, place: Plac
 def _scaling(stage: Autoencoder) -> float:
     """One over the standard deviation of latents (Rombach et al., CVPR 2022, App. G)."""
     image = network_image(picture_batch(stage.source, 0, count=32), size=128)
-    return round(1 / float(stage.average.encode(image).latent_dist.mean.std()), 4)  # type: ignore[operator]
+    return round(1 / float(stage.average.encode(image).latent_dist.mean.std()), 4)
 
 
 def _mixed() -> torch.autocast:

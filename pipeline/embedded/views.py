@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,7 +51,8 @@ def write_shard(path: Path, seeds: range, *, clusters: int) -> None:
         return
     found = [cluster for seed in seeds for cluster in object_clusters(seed, clusters=clusters)]
     partial = path.with_suffix(".partial.npz")
-    np.savez(partial, **{name: np.stack([c[k] for c in found]) for k, name in enumerate(FIELDS)})
+    arrays: dict[str, Any] = {name: np.stack([c[k] for c in found]) for k, name in enumerate(FIELDS)}
+    np.savez(partial, **arrays)
     partial.rename(path)
 
 

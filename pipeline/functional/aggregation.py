@@ -18,6 +18,7 @@ class Aggregation(nn.Module):
 
     def __init__(self, channels: Mapping[int, int], dim: int) -> None:
         super().__init__()
+        self.channels = dict(channels)
         self.layers = tuple(channels)
         self.mix = nn.ModuleList([nn.Conv2d(channels[layer], dim, 1) for layer in self.layers])
         self.widen, self.narrow = nn.Conv2d(dim, 2 * dim, 1), nn.Conv2d(2 * dim, dim, 1)

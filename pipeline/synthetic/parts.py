@@ -70,6 +70,7 @@ def polygon_radius(corner: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " 
 
 
 def together(parts: list[Shape]) -> Shape:
+    """Several shapes as one."""
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
     faces = [part_faces + offset for (_, part_faces), offset in zip(parts, offsets, strict=True)]
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
@@ -82,6 +83,7 @@ def noise(points: Float[np.ndarray, "n 3"], rng: Rng, *, scale: float, waves: in
 
 
 def random_direction(rng: Rng) -> Float[np.ndarray, " 3"]:
+    """A unit vector, uniform on the sphere."""
     v = rng.normal(size=3)
     return v / np.linalg.norm(v)
 

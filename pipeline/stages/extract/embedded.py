@@ -76,10 +76,10 @@ def shipped_config() -> dict[str, Any]:
     path = FOLDER / "config.json"
     if not path.exists():
         raise BadInput(path, found="nothing", needed="the embedded model (make train-embedded), or another extract")
-    return json.loads(path.read_text())  # type: ignore[no-any-return]
+    return dict(json.loads(path.read_text()))
 
 
-def untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[nn.Module, nn.Module]:
+def untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
     """U-Net and autoencoder of the given configs, freshly initialised: for training."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
