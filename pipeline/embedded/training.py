@@ -93,7 +93,7 @@ class Stage(ABC):
         self.average = copy.deepcopy(self.model).requires_grad_(False)
 
     @abstractmethod
-    def build(self, place: Place) -> nn.Module:
+    def build(self, place: Place) -> Any:
         """The network, freshly initialised or as an earlier stage left it."""
 
     @abstractmethod
@@ -118,7 +118,7 @@ class Autoencoder(Stage):
 
     name, rate = "autoencoder", 2e-3
 
-    def build(self, place: Place) -> nn.Module:
+    def build(self, place: Place) -> Any:
         """From nothing."""
         return untrained(UNET, VAE)[1]
 
@@ -139,7 +139,7 @@ class Denoiser(Stage):
 
     name, rate = "denoiser", 1.5e-3
 
-    def build(self, place: Place) -> nn.Module:
+    def build(self, place: Place) -> Any:
         """From nothing, on the latents of the autoencoder."""
         self.encode = Latents(place)
         self.alphas = torch.from_numpy(alphas_cumprod({})).float()
@@ -162,7 +162,7 @@ class Descriptors(Stage):
 
     name, rate = "descriptors", 1e-3
 
-    def build(self, place: Place) -> nn.Module:
+    def build(self, place: Place) -> Any:
         """On from the denoiser's average."""
         self.encode = Latents(place)
         unet = untrained(UNET, VAE)[0]
@@ -172,7 +172,7 @@ class Descriptors(Stage):
     def loss(self, step: int) -> dict[str, Tensor]:
         """Both losses of 4 clusters of 8 pictures."""
         batch = pair_batch(self.source, step, count=4)
-        return described_losses(self.model, self.encode(batch.rgb), batch)  # type: ignore[arg-type]
+        return described_losses(self.model, self.encode(batch.rgb), batch)
 
 
 class Described(nn.Module):
@@ -242,7 +242,9 @@ def train(stage: Stage, place: Place, *, until: float, save_every_s: float = 90.
         norm = nn.utils.clip_grad_norm_(stage.model.parameters(), 1.0)
         optimiser.step()
         stage.follow(step)
-        record = {name: round(float(value), 5) for name, value in terms.items()} | {"norm": round(float(norm), 3)}
+        record = {name: round(float(value.detach()), 5) for name, value in terms.items()} | {
+            "norm": round(float(norm), 3)
+        }
         _note(place, stage, {"step": step, **record, "time_s": round(time.monotonic() - started, 3)})
         step += 1
         if time.monotonic() - saved_at > save_every_s:
