@@ -32,6 +32,9 @@ def export(place: Place, folder: Path) -> int:
     if described is not None:
         made["unet_learned.safetensors"] = _half(_below("unet.", described["average"]))
         made["head.safetensors"] = _half(_below("head.", described["average"]))
+    saved = {"autoencoder": autoencoder, "denoiser": denoiser, "descriptors": described}
+    steps = {stage: state["step"] for stage, state in saved.items() if state is not None}
+    made["steps.json"] = (json.dumps(steps, indent=1) + "\n").encode()
     size = sum(map(len, made.values()))
     if size > MOST_BYTES:
         raise ValueError(f"{size} bytes of weights, at most {MOST_BYTES} may ship")

@@ -97,6 +97,7 @@ def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(place, tmp_pa
     names = {path.name for path in (tmp_path / "weights").iterdir()}
     assert names == {
         "config.json",
+        "steps.json",
         "vae.safetensors",
         "unet_pure.safetensors",
         "unet_learned.safetensors",
