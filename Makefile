@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo ablations sweeps ladder report test test-fast lint clean
+.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder report test test-fast lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -56,6 +56,12 @@ sweeps: $(STAMP) ## what the paper did not ablate, on the demo data
 
 ladder: $(STAMP) ## the oracle ladder on the demo data: true mask, true template, true correspondences
 	@$(call sweep,ladder)
+
+train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints; ARGS="--minutes 600 --scale 5" for longer
+	$(PY) -m pipeline.embedded $(ARGS)
+
+benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights; ARGS="--lmo ... --detections ..."
+	$(PY) -m pipeline.embedded --benchmark $(ARGS)
 
 report: $(STAMP) ## one page of all runs below results/: results/report/index.html
 	$(PY) -m pipeline step=report $(ARGS)

@@ -11,9 +11,18 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.functional.viewpoints import unit_sphere
 from pipeline.items.objects import Mesh
 from pipeline.meshes import diameter_mm
-
-Shape = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
-Rng = np.random.Generator
+from pipeline.synthetic.parts import (
+    Rng,
+    Shape,
+    noise,
+    polygon_radius,
+    random_direction,
+    random_rotation,
+    superquadric,
+    together,
+    tube,
+    turned,
+)
 
 FAMILIES = ("pebble", "superquadrics", "vessel", "prism", "machined", "twist")
 DIAMETERS_MM = (60.0, 250.0)
@@ -39,34 +48,34 @@ def make_object(seed: int) -> Mesh:
 def _pebble(rng: Rng) -> Shape:
     """A sphere displaced by smooth noise, stretched along its axes."""
     points, faces = unit_sphere(4)
-    radius = 1 + 0.35 * _noise(points, rng, scale=0.9) + 0.1 * _noise(points, rng, scale=0.35)
+    radius = 1 + 0.35 * noise(points, rng, scale=0.9) + 0.1 * noise(points, rng, scale=0.35)
     return points * np.maximum(radius, 0.3)[:, None] * rng.uniform(0.6, 1.2, 3), faces
 
 
 def _superquadrics(rng: Rng) -> Shape:
     """Three to four superquadrics (Barr, 1981) of falling size, each grown onto the first."""
     size = rng.uniform(0.6, 1.2, 3)
-    parts = [_superquadric(rng, size)]
+    parts = [superquadric(rng, size)]
     for k in range(int(rng.integers(2, 4))):
-        part, faces = _superquadric(rng, rng.uniform(0.25, 0.6, 3) * (1 - 0.15 * k))
-        parts.append((part + size * _direction(rng), faces))
-    return _together(parts)
+        part, faces = superquadric(rng, rng.uniform(0.25, 0.6, 3) * (1 - 0.15 * k))
+        parts.append((part + size * random_direction(rng), faces))
+    return together(parts)
 
 
 def _vessel(rng: Rng) -> Shape:
     """A turned body with a dent, and a handle on one side."""
     rows, segments = 70, 64
     height = np.linspace(-1, 1, rows)
-    profile = 0.55 + 0.2 * _noise(np.stack([height, 0 * height, 0 * height], axis=-1), rng, scale=0.7)
+    profile = 0.55 + 0.2 * noise(np.stack([height, 0 * height, 0 * height], axis=-1), rng, scale=0.7)
     angle = 2 * np.pi * np.arange(segments) / segments
     away = np.abs((angle - rng.uniform(1, 5) + np.pi) % (2 * np.pi) - np.pi)
     dent = 0.3 * np.exp(-((height[:, None] - rng.uniform(-0.5, 0.5)) ** 2) / 0.08 - away**2 / 0.3)
-    body = _turned(np.maximum(profile, 0.25)[:, None] * np.ones(segments) * (1 - dent), height)
+    body = turned(np.maximum(profile, 0.25)[:, None] * np.ones(segments) * (1 - dent), height)
     bow = np.linspace(0.15, np.pi - 0.15, 40)
     reach, span = rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.55)
     middle = rng.uniform(-0.35, 0.25)
     path = np.stack([0.4 + reach * np.sin(bow), np.zeros(40), middle + span * np.cos(bow)], axis=-1)
-    return _together([body, _tube(path, rng.uniform(0.07, 0.12))])
+    return together([body, tube(path, rng.uniform(0.07, 0.12))])
 
 
 def _prism(rng: Rng) -> Shape:
@@ -76,25 +85,25 @@ def _prism(rng: Rng) -> Shape:
     at = np.sort((np.arange(corners) + rng.uniform(-0.3, 0.3, corners)) * 2 * np.pi / corners)
     reach = rng.uniform(0.55, 1.0, corners)
     corner = np.stack([reach * np.cos(at), reach * np.sin(at)], axis=-1)
-    outline = _polygon_radius(corner, angle)
+    outline = polygon_radius(corner, angle)
     rows = 40
     height = np.linspace(-1, 1, rows) * rng.uniform(0.3, 0.6)
-    body = _turned(outline[None] * np.linspace(1, rng.uniform(0.6, 0.9), rows)[:, None], height)
-    boss, faces = _turned(np.full((14, 40), rng.uniform(0.15, 0.25)), np.linspace(0, rng.uniform(0.2, 0.4), 14), lid=4)
-    return _together([body, (boss + np.array([*rng.uniform(-0.25, 0.25, 2), height[-1] - 0.05]), faces)])
+    body = turned(outline[None] * np.linspace(1, rng.uniform(0.6, 0.9), rows)[:, None], height)
+    boss, faces = turned(np.full((14, 40), rng.uniform(0.15, 0.25)), np.linspace(0, rng.uniform(0.2, 0.4), 14), lid=4)
+    return together([body, (boss + np.array([*rng.uniform(-0.25, 0.25, 2), height[-1] - 0.05]), faces)])
 
 
 def _machined(rng: Rng) -> Shape:
     """A block with a second block and two or three cylinders on different sides of it."""
     size = rng.uniform(0.4, 1.0, 3)
-    other, other_faces = _superquadric(rng, rng.uniform(0.3, 0.5, 3), roundness=0.2)
-    parts = [_superquadric(rng, size, roundness=0.2), (other + size * np.sign(_direction(rng)) * 0.6, other_faces)]
+    other, other_faces = superquadric(rng, rng.uniform(0.3, 0.5, 3), roundness=0.2)
+    parts = [superquadric(rng, size, roundness=0.2), (other + size * np.sign(random_direction(rng)) * 0.6, other_faces)]
     for axis in rng.permutation(3)[: int(rng.integers(2, 4))]:
         radius, length = rng.uniform(0.12, 0.25), rng.uniform(0.3, 0.7)
-        pin, faces = _turned(np.full((24, 40), radius), np.linspace(0, length, 24), lid=3)
+        pin, faces = turned(np.full((24, 40), radius), np.linspace(0, length, 24), lid=3)
         pin = np.roll(pin + np.array([*rng.uniform(-0.2, 0.2, 2), size[axis] * 0.9]), axis + 1, axis=-1)
         parts.append((pin * np.where(np.arange(3) == axis, rng.choice([-1, 1]), 1), faces))
-    return _together(parts)
+    return together(parts)
 
 
 def _twist(rng: Rng) -> Shape:
@@ -103,7 +112,7 @@ def _twist(rng: Rng) -> Shape:
     along = np.linspace(0, 1, rows)
     angle = 2 * np.pi * np.arange(segments) / segments
     lobes = 1 + rng.uniform(0.15, 0.35) * np.cos(int(rng.integers(2, 5)) * angle) + 0.15 * np.cos(angle)
-    vertices, faces = _turned((0.25 + 0.3 * along**2)[:, None] * lobes, 2 * along - 1)
+    vertices, faces = turned((0.25 + 0.3 * along**2)[:, None] * lobes, 2 * along - 1)
     turn = rng.uniform(1.0, 3.0) * vertices[:, 2]
     x = np.cos(turn) * vertices[:, 0] - np.sin(turn) * vertices[:, 1]
     y = np.sin(turn) * vertices[:, 0] + np.cos(turn) * vertices[:, 1]
@@ -113,76 +122,6 @@ def _twist(rng: Rng) -> Shape:
 _BUILDERS: dict[str, Callable[[Rng], Shape]] = dict(
     zip(FAMILIES, (_pebble, _superquadrics, _vessel, _prism, _machined, _twist), strict=True)
 )
-
-
-def _superquadric(rng: Rng, size: Float[np.ndarray, " 3"], roundness: float | None = None) -> Shape:
-    """|x|^p + |y|^p + |z|^p = 1 with p = 2 / roundness, scaled; 1 is an ellipsoid, 0.2 nearly a box."""
-    power = 2 / (rng.uniform(0.3, 1.2) if roundness is None else roundness)
-    points, faces = unit_sphere(3)
-    return points / (np.abs(points) ** power).sum(axis=-1, keepdims=True) ** (1 / power) * size, faces
-
-
-def _turned(radius: Float[np.ndarray, "r s"], height: Float[np.ndarray, " r"], *, lid: int = 10) -> Shape:
-    """Rings of ``s`` points about the z axis, one above another, closed at both ends by ``lid`` rings and a point."""
-    shrink = (np.arange(lid) + 0.5) / lid
-    radius = np.concatenate([radius[:1] * shrink[:, None], radius, radius[-1:] * shrink[::-1, None]])
-    height = np.concatenate([np.repeat(height[0], lid), height, np.repeat(height[-1], lid)])
-    segments = radius.shape[1]
-    angle = 2 * np.pi * np.arange(segments) / segments
-    rings = np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(height[:, None], radius.shape)], -1
-    )
-    return _closed_grid(rings)
-
-
-def _tube(path: Float[np.ndarray, "r 3"], radius: float) -> Shape:
-    """A round tube along a path in the x-z plane, closed at both ends."""
-    tangent = np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
-    side = np.array([0.0, 1.0, 0.0])
-    angle = 2 * np.pi * np.arange(16) / 16
-    ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(tangent, side)[:, None]
-    return _closed_grid(path[:, None] + radius * ring)
-
-
-def _closed_grid(rings: Float[np.ndarray, "r s 3"]) -> Shape:
-    """Triangles between neighbouring rings, and a point in the middle of the first and the last."""
-    r, s, _ = rings.shape
-    low = (np.arange(r - 1)[:, None] * s + np.arange(s)).reshape(-1)
-    next_low = (np.arange(r - 1)[:, None] * s + (np.arange(s) + 1) % s).reshape(-1)
-    sides = [np.stack([low, next_low, low + s], -1), np.stack([next_low, next_low + s, low + s], -1)]
-    k, following = np.arange(s), (np.arange(s) + 1) % s
-    top = (r - 1) * s
-    caps = [
-        np.stack([following, k, np.full(s, r * s)], -1),
-        np.stack([top + k, top + following, np.full(s, r * s + 1)], -1),
-    ]
-    ends = np.stack([rings[0].mean(axis=0), rings[-1].mean(axis=0)])
-    return np.concatenate([rings.reshape(-1, 3), ends]), np.concatenate(sides + caps)
-
-
-def _polygon_radius(corner: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
-    """Distance from the origin, which lies inside, to the outline in each direction."""
-    a, edge = corner, np.roll(corner, -1, axis=0) - corner
-    ray = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
-    cross = ray[..., 0] * edge[:, 1] - ray[..., 1] * edge[:, 0]
-    cross = np.where(np.abs(cross) < 1e-12, 1e-12, cross)
-    distance = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) / cross
-    where = (a[:, 0] * ray[..., 1] - a[:, 1] * ray[..., 0]) / cross
-    meets = (distance > 0) & (where >= -1e-9) & (where <= 1 + 1e-9)
-    return np.where(meets, distance, np.inf).min(axis=1)
-
-
-def _together(parts: list[Shape]) -> Shape:
-    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
-    faces = [part_faces + offset for (_, part_faces), offset in zip(parts, offsets, strict=True)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
-
-
-def _noise(points: Float[np.ndarray, "n 3"], rng: Rng, *, scale: float, waves: int = 24) -> Float[np.ndarray, " n"]:
-    """A smooth random function of space, of about unit variance, whose bumps are ``scale`` wide."""
-    k = rng.normal(size=(waves, 3)) / scale
-    return np.sin(points @ k.T + rng.uniform(0, 2 * np.pi, waves)).sum(axis=-1) * (2 / waves) ** 0.5
 
 
 def _solid_texture(vertices: Float[np.ndarray, "v 3"], rng: Rng) -> UInt8[np.ndarray, "v 3"]:
@@ -195,7 +134,7 @@ def _solid_texture(vertices: Float[np.ndarray, "v 3"], rng: Rng) -> UInt8[np.nda
     for _ in range(int(rng.integers(2, 4))):
         where = _pattern(points, rng) & np.isin(region, rng.permutation(region.max() + 1)[: region.max() // 2 + 1])
         colours = np.where(where[:, None], palette[rng.integers(len(palette))], colours)
-    dirt = 1 + 0.1 * _noise(points, rng, scale=0.25) + 0.05 * _noise(points, rng, scale=0.06)
+    dirt = 1 + 0.1 * noise(points, rng, scale=0.25) + 0.05 * noise(points, rng, scale=0.06)
     return np.clip(colours * dirt[:, None], 0, 255).astype(np.uint8)
 
 
@@ -211,7 +150,7 @@ def _palette(rng: Rng) -> Float[np.ndarray, "k 3"]:
 def _cells(points: Float[np.ndarray, "n 3"], rng: Rng, *, count: int) -> Int[np.ndarray, " n"]:
     """Nearest of ``count`` random seeds, its borders warped."""
     seeds = points[rng.integers(len(points), size=count)]
-    warped = points + 0.05 * np.stack([_noise(points, rng, scale=0.2) for _ in range(3)], axis=-1)
+    warped = points + 0.05 * np.stack([noise(points, rng, scale=0.2) for _ in range(3)], axis=-1)
     return ((warped[:, None] - seeds) ** 2).sum(-1).argmin(axis=1)
 
 
@@ -226,16 +165,4 @@ def _pattern(points: Float[np.ndarray, "n 3"], rng: Rng) -> Bool[np.ndarray, " n
     if kind == 2:
         spots = points[rng.integers(len(points), size=40)]
         return ((points[:, None] - spots) ** 2).sum(-1).min(axis=1) < (0.5 * width) ** 2
-    return _noise(points, rng, scale=width) > 0.3
-
-
-def _direction(rng: Rng) -> Float[np.ndarray, " 3"]:
-    v = rng.normal(size=3)
-    return v / np.linalg.norm(v)
-
-
-def random_rotation(rng: Rng) -> Float[np.ndarray, "3 3"]:
-    """Uniform on SO(3): the QR decomposition of a Gaussian matrix, signs fixed (Mezzadri, 2007)."""
-    Q, R = np.linalg.qr(rng.normal(size=(3, 3)))
-    Q = Q * np.sign(np.diag(R))
-    return Q * np.sign(np.linalg.det(Q))
+    return noise(points, rng, scale=width) > 0.3

@@ -1,0 +1,55 @@
+"""``python -m pipeline.embedded``: the embedded model, from nothing to weights, as far as the time allows.
+
+``--benchmark`` measures what ships beside its controls instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+
+from pipeline.embedded.benchmark import benchmark
+from pipeline.embedded.export import export
+from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
+from pipeline.embedded.views import make_shard
+
+WEIGHTS = Path(__file__).parent / "weights"
+
+
+def main() -> None:
+    """Parse, then train the stages in turn."""
+    parser = argparse.ArgumentParser(prog="python -m pipeline.embedded", description=__doc__)
+    parser.add_argument("--folder", type=Path, default=Path("cache/embedded"), help="shards, checkpoints, loss curves")
+    parser.add_argument("--minutes", type=float, default=120.0, help="stop after so long; the next call goes on")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the number of steps: more on a faster machine")
+    parser.add_argument("--threads", type=int, default=0, help="0 = all cores")
+    parser.add_argument("--benchmark", action="store_true", help="measure instead of training; cache in --folder")
+    parser.add_argument("--lmo", type=Path, help="benchmark: folder of LM-O, for the same table on photographs")
+    parser.add_argument("--detections", type=Path, help="benchmark: a detector's json for LM-O")
+    options = parser.parse_args()
+    if options.benchmark:
+        print(benchmark(options.folder.resolve(), lmo=options.lmo, detections=options.detections))
+    else:
+        run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Shards first as far as the first steps need them, then each stage to its end."""
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    until, place, plan = time.time() + 60 * options.minutes, Place(options.folder), Plan()
+    for index in range(8):
+        make_shard(place.folder / "shards", index)
+    for kind, steps in ((Autoencoder, plan.autoencoder), (Denoiser, plan.denoiser), (Descriptors, plan.descriptors)):
+        if not train(kind(plan, place, round(steps * options.scale)), place, until=until):
+            print(f"{kind.name}: time is up; the next call goes on from here")
+            break
+        print(f"{kind.name}: done")
+    print(f"{export(place, WEIGHTS) / 1e6:.1f} MB of weights in {WEIGHTS}")
+
+
+if __name__ == "__main__":
+    main()

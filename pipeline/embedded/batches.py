@@ -1,0 +1,149 @@
+"""shards -> batches: pictures alone, or queries and templates with exact correspondences. A step's batch is its own.
+
+Nothing is kept between steps: a batch depends on seed and step alone, so a resumed training sees what it would have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pipeline.embedded.pictures import Picture, View, photograph, template
+from pipeline.embedded.views import SIZE, VIEWS, Views, make_shard, read_shard
+from pipeline.functional.rigid import rotation_angle_deg
+from pipeline.synthetic.parts import Rng
+
+CELLS = 32  # of the finest map
+QUERIES, TEMPLATES = 2, VIEWS - 1  # of a cluster
+_POINTS = 96  # correspondences of a pair at most
+_TOLERANCE = 0.03  # of the object's radius: a point this far behind what a template shows there is hidden in it
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where shards lie; ``count`` of them, the first few from the start, one more every ``pace`` steps."""
+
+    folder: Path
+    count: int
+    seed: int = 0
+    start: int = 8
+    pace: int = 8
+    validation: bool = False
+
+    def clusters(self, step: int, count: int) -> tuple[list[list[View]], Rng]:
+        """The clusters of a step, each of another object, and the generator of all its further draws."""
+        rng = np.random.default_rng([self.seed, step, 0xBA7C])
+        known = min(self.count, self.start + step // self.pace)
+        found = []
+        for _ in range(count):
+            views = _shard(self.folder, int(rng.integers(known)), self.validation)
+            k = int(rng.integers(len(views)))
+            found.append([_unpacked(views, k, v) for v in range(VIEWS)])
+        return found, rng
+
+
+@dataclass(frozen=True, eq=False)
+class PairBatch:
+    """b clusters of q queries and t templates. Correspondences of each pair, up to m: cells as (x, y), floats.
+
+    ``matched`` says which of them are; ``angle_deg`` lies between each query's and template's rotation.
+    """
+
+    rgb: UInt8[Tensor, "n S S 3"]
+    mask: Bool[Tensor, "n S S"]
+    query_xy: Float[Tensor, "b q t m 2"]
+    template_xy: Float[Tensor, "b q t m 2"]
+    matched: Bool[Tensor, "b q t m"]
+    angle_deg: Float[Tensor, "b q t"]
+
+
+def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n S S 3"]:
+    """Pictures of all sorts: two in three are photographs."""
+    clusters, rng = source.clusters(step, count)
+    views = [cluster[int(rng.integers(VIEWS))] for cluster in clusters]
+    made = [photograph(v, rng) if rng.uniform() < 0.67 else template(v, rng) for v in views]
+    return torch.from_numpy(np.stack([p.rgb for p in made]))
+
+
+def pair_batch(source: Source, step: int, *, count: int) -> PairBatch:
+    """Clusters with two photographs of the query's view each, and the other views as templates."""
+    clusters, rng = source.clusters(step, count)
+    pictures: list[Picture] = []
+    parts = []
+    for views in clusters:
+        queries = [photograph(views[0], rng) for _ in range(QUERIES)]
+        templates = [template(view, rng) for view in views[1:]]
+        pictures += queries + templates
+        found = [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
+        R = np.stack([view.T[:3, :3] for view in views[1:]]).astype(np.float64)
+        angle = rotation_angle_deg(np.broadcast_to(views[0].T[:3, :3].astype(np.float64), R.shape), R)
+        parts.append((*(np.stack(p) for p in zip(*found, strict=True)), np.stack([angle] * QUERIES)))
+    q, t, ok, angle = (np.stack(p) for p in zip(*parts, strict=True))
+    shape = (len(clusters), QUERIES, TEMPLATES, _POINTS)
+    return PairBatch(
+        torch.from_numpy(np.stack([p.rgb for p in pictures])),
+        torch.from_numpy(np.stack([p.mask for p in pictures])),
+        torch.from_numpy(q).reshape(*shape, 2),
+        torch.from_numpy(t).reshape(*shape, 2),
+        torch.from_numpy(ok).reshape(shape),
+        torch.from_numpy(angle.astype(np.float32)),
+    )
+
+
+@lru_cache(maxsize=200)
+def _shard(folder: Path, index: int, validation: bool) -> Views:
+    return read_shard(make_shard(folder, index, validation=validation))
+
+
+def _unpacked(views: Views, cluster: int, view: int) -> View:
+    return View(
+        views.albedo[cluster, view],
+        views.normal[cluster, view].astype(np.float32) / 127,
+        views.depth[cluster, view].astype(np.float32),
+        views.K[cluster, view],
+        views.T[cluster, view],
+    )
+
+
+def _correspondences(
+    query: Picture, view: View, other: View, rng: Rng
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Bool[np.ndarray, " m"]]:
+    """Cells of the query, drawn from those that another view shows as well, and where it shows them."""
+    stride = SIZE / CELLS
+    cell_xy = np.stack(np.meshgrid(np.arange(CELLS), np.arange(CELLS)), axis=-1).reshape(-1, 2)
+    crop_px = (cell_xy + 0.5) * stride - 0.5
+    scale, shift = query.A_crop_view[0, 0], query.A_crop_view[:2, 2]
+    px = np.rint((crop_px - shift) / scale).astype(int)
+    inside = (px >= 0).all(1) & (px < SIZE).all(1)
+    x, y = np.where(inside[:, None], px, 0).T
+    at = np.rint(crop_px).astype(int)
+    inside &= query.seen[y, x] & view.mask[y, x] & query.mask[at[:, 1], at[:, 0]]
+    other_px, visible = _seen_in(other, _object_points(view, px[inside]))
+    found = np.flatnonzero(visible)
+    found = found[rng.permutation(len(found))[:_POINTS]]
+    rows = np.zeros((2, _POINTS, 2), np.float32)
+    rows[0, : len(found)] = cell_xy[inside][found]
+    rows[1, : len(found)] = (other_px[found] + 0.5) / stride - 0.5
+    return rows[0], rows[1], np.arange(_POINTS) < len(found)
+
+
+def _object_points(view: View, px: np.ndarray) -> Float[np.ndarray, "m 3"]:
+    z = view.depth[px[:, 1], px[:, 0]] + view.T[2, 3]
+    K, T = view.K.astype(np.float64), view.T.astype(np.float64)
+    points = np.stack([(px[:, 0] - K[0, 2]) / K[0, 0] * z, (px[:, 1] - K[1, 2]) / K[1, 1] * z, z], axis=-1)
+    return (points - T[:3, 3]) @ T[:3, :3]
+
+
+def _seen_in(view: View, points: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, " m"]]:
+    """Pixels of object points in a view, and whether nothing hides them there."""
+    T, K = view.T.astype(np.float64), view.K.astype(np.float64)
+    in_camera = points @ T[:3, :3].T + T[:3, 3]
+    px = in_camera[:, :2] / in_camera[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    x, y = np.clip(np.rint(px), 0, SIZE - 1).astype(int).T
+    return px, np.abs(view.depth[y, x] + T[2, 3] - in_camera[:, 2]) < _TOLERANCE

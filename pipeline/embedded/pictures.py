@@ -1,0 +1,164 @@
+"""views -> pictures: templates as the pipeline draws them, and photographs of every kind of badness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.embedded.views import NOTHING, SIZE
+from pipeline.functional.camera import mask_bbox, square_crop
+from pipeline.functional.shading import lit
+from pipeline.synthetic.parts import Rng
+
+AMBIENT, DIFFUSE = 0.45, 0.55  # of templates: conf/render
+_LEAST_SEEN = 0.3  # of the silhouette, whatever hides the rest
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One view of ``views.Views``."""
+
+    albedo: UInt8[np.ndarray, "S S 3"]
+    normal: Float32[np.ndarray, "S S 3"]
+    depth: Float32[np.ndarray, "S S"]
+    K: Float32[np.ndarray, "3 3"]
+    T: Float32[np.ndarray, "4 4"]
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "S S"]:
+        """Pixels that show the object."""
+        return self.depth > NOTHING / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A crop as the extractor gets it. ``seen``: pixels of the view that it shows; A_crop_view takes them there."""
+
+    rgb: UInt8[np.ndarray, "S S 3"]
+    mask: Bool[np.ndarray, "S S"]
+    seen: Bool[np.ndarray, "S S"]
+    A_crop_view: Float[np.ndarray, "3 3"]
+
+
+def template(view: View, rng: Rng) -> Picture:
+    """As render and crop draw it: one headlight, black ground; a little softer on some, as supersampled ones are."""
+    rays = _rays(view)
+    colour = lit(view.albedo.astype(np.float32), view.normal, rays, ambient=AMBIENT, diffuse=DIFFUSE)
+    if rng.uniform() < 0.5:
+        colour = cv2.GaussianBlur(colour, (0, 0), rng.uniform(0.3, 0.6))
+    rgb = np.rint(np.clip(colour * view.mask[..., None], 0, 255)).astype(np.uint8)
+    return Picture(rgb, view.mask, view.mask, np.eye(3))
+
+
+def photograph(view: View, rng: Rng) -> Picture:
+    """Another light, camera and crop; hidden in part, small, blurred, noisy, its mask not quite right."""
+    colour, ground = _relit(view, rng), _ground(rng)
+    seen = _hidden(view.mask, rng) if rng.uniform() < 0.6 else view.mask
+    colour = np.where(seen[..., None], colour, ground)
+    mask = _wrong_mask(seen, rng) if rng.uniform() < 0.6 else seen
+    box = mask_bbox(mask)
+    assert box is not None
+    A_crop_view = square_crop(box, size=SIZE, padding_ratio=1.2)
+    rgb, cropped = _taken(colour, mask, A_crop_view, rng)
+    return Picture(rgb, cropped, seen & mask, A_crop_view)
+
+
+def _rays(view: View) -> Float32[np.ndarray, "S S 3"]:
+    x = (np.arange(SIZE, dtype=np.float32) - view.K[0, 2]) / view.K[0, 0]
+    y = (np.arange(SIZE, dtype=np.float32) - view.K[1, 2]) / view.K[1, 1]
+    return np.stack([*np.meshgrid(x, y), np.ones((SIZE, SIZE), np.float32)], axis=-1)
+
+
+def _relit(view: View, rng: Rng) -> Float32[np.ndarray, "S S 3"]:
+    """Lambert under one or two lights with gloss; colours, white balance, exposure and contrast of another camera."""
+    albedo = view.albedo.astype(np.float32)
+    grey = albedo.mean(axis=-1, keepdims=True)
+    albedo = grey + (albedo - grey) * rng.uniform(0.2, 1.3)
+    ambient, diffuse, gloss = rng.uniform(0.2, 0.7), rng.uniform(0.3, 0.9), rng.choice([0.0, rng.uniform(0, 0.5)])
+    shade, shine = ambient, 0.0
+    for strength in (diffuse, rng.choice([0.0, rng.uniform(0, 0.5)])):
+        toward = rng.normal(size=3) * [1, 1, 0.6] + [0, -0.6, -0.9]
+        toward /= np.linalg.norm(toward)
+        half = toward - np.array([0.0, 0.0, 1.0])
+        shade = shade + strength * np.maximum(view.normal @ toward.astype(np.float32), 0)
+        lobe = np.maximum(view.normal @ (half / np.linalg.norm(half)).astype(np.float32), 0)
+        shine = shine + strength * lobe ** rng.uniform(8, 50)
+    colour = albedo * np.asarray(shade)[..., None] + 255 * gloss * np.asarray(shine)[..., None]
+    tint = rng.uniform(0.8, 1.2, 3) * np.exp(rng.uniform(-0.6, 0.35))
+    colour = np.clip(colour * tint, 0, 255) / 255
+    lifted = colour ** np.exp(rng.uniform(-0.4, 0.4)) * (1 - rng.uniform(0, 0.12)) + rng.uniform(0, 0.1)
+    return (255 * lifted).astype(np.float32)
+
+
+def _ground(rng: Rng) -> Float32[np.ndarray, "S S 3"]:
+    """What stands behind and before the object: blotches of colour, smooth or sharp."""
+    steps = int(rng.integers(2, 24))
+    blotches = rng.uniform(0, 255, 3) + rng.normal(0, 60, (steps, steps, 1)) + rng.normal(0, 25, (steps, steps, 3))
+    how = cv2.INTER_CUBIC if rng.uniform() < 0.6 else cv2.INTER_NEAREST
+    return np.clip(cv2.resize(blotches.astype(np.float32), (SIZE, SIZE), interpolation=how), 0, 255)
+
+
+def _hidden(mask: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
+    """The silhouette less a half plane, an ellipse or a polygon; less and less is hidden until enough is seen."""
+    centre = np.argwhere(mask)[rng.integers(mask.sum())][::-1].astype(float)
+    kind, size, angle = rng.integers(3), rng.uniform(15, 60), rng.uniform(0, 2 * np.pi)
+    corners = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 8))))
+    aspect = rng.uniform(0.3, 1.0)
+    for shrink in (1.0, 0.7, 0.45, 0.25):
+        cover = np.zeros(mask.shape, np.uint8)
+        if kind == 0:
+            y, x = np.mgrid[:SIZE, :SIZE] - np.array([SIZE / 2, SIZE / 2])[:, None, None]
+            cover = (x * np.cos(angle) + y * np.sin(angle) > SIZE / 2 * (1 - shrink * size / 60)).astype(np.uint8)
+        elif kind == 1:
+            axes = (int(size * shrink) + 1, int(size * aspect * shrink) + 1)
+            cv2.ellipse(cover, (int(centre[0]), int(centre[1])), axes, float(np.degrees(angle)), 0, 360, 1, -1)
+        else:
+            outline = centre + size * shrink * np.stack([np.cos(corners), np.sin(corners)], -1)
+            cv2.fillPoly(cover, [np.rint(outline).astype(np.int32)], 1)
+        seen = mask & (cover == 0)
+        if seen.sum() >= max(_LEAST_SEEN * mask.sum(), 60):
+            return seen
+    return mask
+
+
+def _wrong_mask(seen: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
+    """The outline wavers; on some, a piece is missing or something else belongs to it."""
+    steps = int(rng.integers(3, 20))
+    waver = cv2.resize(rng.normal(size=(steps, steps)).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
+    soft = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), rng.uniform(1, 5))
+    mask = soft + rng.uniform(0.02, 0.25) * waver > rng.uniform(0.35, 0.65)
+    if rng.uniform() < 0.35:
+        at = np.argwhere(cv2.Canny(seen.astype(np.uint8) * 255, 50, 150) > 0)
+        piece = np.zeros(mask.shape, np.uint8)
+        y, x = at[rng.integers(len(at))] if len(at) else (SIZE // 2, SIZE // 2)
+        axes = (int(rng.integers(4, 28)), int(rng.integers(4, 28)))
+        cv2.ellipse(piece, (int(x), int(y)), axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
+        mask = mask | (piece > 0) if rng.uniform() < 0.5 else mask & (piece == 0)
+    return mask if (mask & seen).sum() >= 0.5 * seen.sum() else seen
+
+
+def _taken(
+    colour: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"], A_crop_view: Float[np.ndarray, "3 3"], rng: Rng
+) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"]]:
+    """The crop of a camera that gives it few pixels: shrunk, blurred, noisy, compressed, masked and enlarged again."""
+    side = int(np.exp(rng.uniform(np.log(28), np.log(SIZE))))
+    A = np.array([[side / SIZE, 0, 0.5 * side / SIZE - 0.5], [0, side / SIZE, 0.5 * side / SIZE - 0.5], [0, 0, 1]])
+    A = A @ A_crop_view
+    soft = 0.4 * max(1 / A[0, 0] - 1, 0) + rng.choice([0.0, rng.uniform(0, 0.8)]) / A[0, 0]
+    if soft > 0.2:
+        colour = cv2.GaussianBlur(colour, (0, 0), soft)
+    small = cv2.warpAffine(colour, A[:2], (side, side), flags=cv2.INTER_LINEAR)
+    inside = cv2.warpAffine(mask.astype(np.float32), A[:2], (side, side), flags=cv2.INTER_LINEAR) >= 0.5
+    if rng.uniform() < 0.3:
+        small = small + rng.uniform(0, 1.2) * (small - cv2.GaussianBlur(small, (0, 0), 1.0))
+    noise = rng.normal(size=small.shape) * rng.choice([1.0, rng.uniform(1, 9)])
+    small = np.clip(small + noise, 0, 255).astype(np.uint8)
+    if rng.uniform() < 0.4:
+        _, code = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))])
+        small = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
+    large = cv2.resize((small * inside[..., None]).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_LINEAR)
+    grown = cv2.resize(inside.astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_LINEAR)
+    return np.rint(large).astype(np.uint8), grown >= 0.5 - 1e-5

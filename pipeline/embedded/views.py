@@ -1,0 +1,117 @@
+"""objects -> what is seen of them from clusters of views, in shards on disk.
+
+A view is kept as albedo, normals and depth, not as a picture: any of them can be drawn as a template is, or under
+any other light, and every cell's object point is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float16, Float32, Int8, UInt8
+
+from pipeline.embedded.shapes import make_training_object
+from pipeline.functional.camera import project, square_crop
+from pipeline.functional.rigid import rigid, transform
+from pipeline.items.objects import Mesh
+from pipeline.stages.render.raycast import surface_points
+from pipeline.synthetic.parts import Rng, random_direction, random_rotation
+
+SIZE = 128
+NOTHING = -100.0
+RINGS_DEG = ((0, 10), (8, 20), (15, 35), (30, 60))
+VIEWS = len(RINGS_DEG) + 3
+"""A cluster: the query's view, one in each ring of angles around it, a half turn of it, and any other."""
+
+FIELDS = ("albedo", "normal", "depth", "K", "T")
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Clusters of ``VIEWS`` views of objects of radius 1. Normals (camera frame) times 127; depth NOTHING off them."""
+
+    albedo: UInt8[np.ndarray, "n v S S 3"]
+    normal: Int8[np.ndarray, "n v S S 3"]
+    depth: Float16[np.ndarray, "n v S S"]
+    K: Float32[np.ndarray, "n v 3 3"]
+    T: Float32[np.ndarray, "n v 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.K)
+
+
+def write_shard(path: Path, seeds: range, *, clusters: int) -> None:
+    """Views of the objects of ``seeds``; a shard that is there is kept, one that was cut short is made anew."""
+    if path.exists():
+        return
+    found = [cluster for seed in seeds for cluster in object_clusters(seed, clusters=clusters)]
+    partial = path.with_suffix(".partial.npz")
+    arrays: dict[str, Any] = {name: np.stack([c[k] for c in found]) for k, name in enumerate(FIELDS)}
+    np.savez(partial, **arrays)
+    partial.rename(path)
+
+
+def read_shard(path: Path) -> Views:
+    """A shard in memory."""
+    with np.load(path) as stored:
+        return Views(*(stored[name] for name in FIELDS))
+
+
+def object_clusters(seed: int, *, clusters: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Clusters of one object's views as arrays in the order of FIELDS."""
+    mesh, rng = make_training_object(seed), np.random.default_rng([seed, 0x71E3])
+    for _ in range(clusters):
+        views = [_view(mesh, R, rng) for R in _rotations(rng)]
+        yield tuple(np.stack(parts) for parts in zip(*views, strict=True))
+
+
+def _rotations(rng: Rng) -> list[Float[np.ndarray, "3 3"]]:
+    """R_cam_obj of a cluster."""
+    query = random_rotation(rng)
+    near = [_turn(random_direction(rng) * np.radians(rng.uniform(*ring))) @ query for ring in RINGS_DEG]
+    axis = np.pi * np.eye(3)[rng.integers(3)]
+    flipped = _turn(random_direction(rng) * np.radians(rng.uniform(0, 15))) @ _turn(axis) @ query
+    return [query, *near, flipped, random_rotation(rng)]
+
+
+def _turn(rotvec: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    return np.asarray(cv2.Rodrigues(rotvec)[0])
+
+
+def _view(mesh: Mesh, R: Float[np.ndarray, "3 3"], rng: Rng) -> tuple[np.ndarray, ...]:
+    """One view, drawn straight into the crop that the pipeline would cut out."""
+    T = rigid(R, np.array([*rng.normal(0, 0.4, 2), rng.uniform(6, 14)]))
+    wide = np.array([[1000.0, 0, 0], [0, 1000.0, 0], [0, 0, 1]])
+    px = project(wide, transform(T, mesh.vertices))
+    box = (*(px.min(axis=0)), *(px.max(axis=0)))
+    K = square_crop(box, size=SIZE, padding_ratio=1.2) @ wide
+    px, albedo, normal, depth = surface_points(mesh, K, T, (SIZE, SIZE))
+    maps = np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros((SIZE, SIZE, 3), np.int8)
+    near = np.full((SIZE, SIZE), NOTHING, np.float16)
+    x, y = px.T
+    maps[0][y, x], maps[1][y, x] = np.rint(albedo), np.rint(127 * normal)
+    near[y, x] = depth - T[2, 3]
+    return *maps, near, K.astype(np.float32), T.astype(np.float32)
+
+
+TRAINING_SEEDS, VALIDATION_SEEDS = 0, 10_000_000
+OBJECTS_PER_SHARD, CLUSTERS_PER_OBJECT = 20, 2
+
+
+def shard_path(folder: Path, index: int, *, validation: bool = False) -> Path:
+    """Where a shard lies."""
+    return folder / f"{'validation' if validation else 'training'}_{index:04d}.npz"
+
+
+def make_shard(folder: Path, index: int, *, validation: bool = False) -> Path:
+    """A shard of training or validation objects; made when it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    first = (VALIDATION_SEEDS if validation else TRAINING_SEEDS) + index * OBJECTS_PER_SHARD
+    path = shard_path(folder, index, validation=validation)
+    write_shard(path, range(first, first + OBJECTS_PER_SHARD), clusters=CLUSTERS_PER_OBJECT)
+    return path

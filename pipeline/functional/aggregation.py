@@ -1,0 +1,41 @@
+"""Feature maps of several layers -> one descriptor for each cell, by a small trained network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import gelu, interpolate
+
+
+class Aggregation(nn.Module):
+    """Each layer scaled to cells of unit mean square, mixed by its own matrix, upsampled and added; then one MLP.
+
+    Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023, with one timestep and a matrix for a bottleneck of each layer.
+    """
+
+    def __init__(self, channels: Mapping[int, int], dim: int) -> None:
+        super().__init__()
+        self.channels = dict(channels)
+        self.layers = tuple(channels)
+        self.mix = nn.ModuleList([nn.Conv2d(channels[layer], dim, 1) for layer in self.layers])
+        self.widen, self.narrow = nn.Conv2d(dim, 2 * dim, 1), nn.Conv2d(2 * dim, dim, 1)
+
+    def forward(self, maps: Mapping[int, Float[Tensor, "n _c _h _w"]]) -> Float[Tensor, "n d h w"]:
+        """Descriptors at the resolution of the finest layer; their lengths mean nothing."""
+        cells = max(maps[layer].shape[-1] for layer in self.layers)
+        total = self._mixed(maps, self.layers, cells)
+        return total + self.narrow(gelu(self.widen(total)))
+
+    def _mixed(self, maps: Mapping[int, Tensor], layers: Sequence[int], cells: int) -> Tensor:
+        total: Tensor | None = None
+        for layer, mix in zip(layers, self.mix, strict=True):
+            x = maps[layer]
+            x = mix(x * torch.rsqrt(x.square().mean(dim=1, keepdim=True) + 1e-4))
+            if x.shape[-1] != cells:
+                x = interpolate(x, size=(cells, cells), mode="bilinear", align_corners=False)
+            total = x if total is None else total + x
+        assert total is not None
+        return total

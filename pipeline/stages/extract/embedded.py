@@ -1,0 +1,102 @@
+"""crops -> feature maps of the small latent diffusion model that ships with the package. No download, no network."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import nn
+
+from pipeline.digests import file_digest
+from pipeline.errors import BadInput
+from pipeline.spec import Positive, digest, spec
+from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.stages.extract.noise import NoiseMode
+from pipeline.stages.extract.weights import alphas_cumprod, empty_model, without_decoder
+
+FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
+PROMPT = (1, 1, 32)  # of zeros: the model knows no text
+
+WeightSet = Literal["learned", "pure"]
+
+
+@spec
+class Embedded(DiffusionFeatures):
+    """A latent diffusion model of Stable Diffusion's architecture and 1/200 of its size, trained on procedural objects.
+
+    ``weights``: ``pure`` has learned to remove noise and nothing else; ``learned`` went on from there, on exact
+    correspondences of rendered pairs, together with the head of ``fuse=learned``. See pipeline/embedded/README.md.
+    """
+
+    kind: ClassVar[str] = "extract.embedded"
+    version: ClassVar[int] = 1
+    notice: ClassVar[str] = (
+        "note: features of the small embedded model, trained on procedural objects; these figures are not Stable "
+        "Diffusion's (extract=stable_diffusion)"
+    )
+
+    weights: WeightSet = "learned"
+    input_size: Positive = 128
+    noise: NoiseMode = "none"
+
+    @property
+    def model(self) -> str:
+        """``embedded-pure-`` or ``embedded-learned-`` and 8 digits of the digest of the weights."""
+        return f"embedded-{self.weights}-{self._digest()[:8]}"
+
+    def recipe(self) -> dict[str, Any]:
+        """As DiffusionFeatures.recipe, with the digest of the weights behind the name of the set."""
+        return super().recipe() | {"weights": f"{self.weights} {self._digest()}"}
+
+    def architecture(self) -> Architecture:
+        """Configs as shipped."""
+        config = shipped_config()
+        return Architecture(config["unet"], config["vae"], alphas_cumprod(config["scheduler"]))
+
+    def load_model(self) -> LoadedModel:
+        """The shipped weights, float16 on disk."""
+        from diffusers import AutoencoderKL, UNet2DConditionModel
+
+        a, dtype = self.architecture(), getattr(torch, self.dtype)
+        unet = _filled(empty_model(UNet2DConditionModel, a.unet, dtype), FOLDER / f"unet_{self.weights}.safetensors")
+        vae = without_decoder(empty_model(AutoencoderKL, a.vae, dtype))
+        return LoadedModel(unet, _filled(vae, FOLDER / "vae.safetensors"), torch.zeros(PROMPT, dtype=dtype))
+
+    def _digest(self) -> str:
+        files = [FOLDER / name for name in ("config.json", f"unet_{self.weights}.safetensors", "vae.safetensors")]
+        return digest([_digest_of(path) for path in files])
+
+
+@lru_cache(maxsize=1)
+def shipped_config() -> dict[str, Any]:
+    """Configs of U-Net, VAE and scheduler as diffusers has them, and of the head. Raises BadInput without them."""
+    path = FOLDER / "config.json"
+    if not path.exists():
+        raise BadInput(path, found="nothing", needed="the embedded model (make train-embedded), or another extract")
+    return dict(json.loads(path.read_text()))
+
+
+def untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
+    """U-Net and autoencoder of the given configs, freshly initialised: for training."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+
+    return UNet2DConditionModel(**unet), AutoencoderKL(**vae)
+
+
+@lru_cache(maxsize=8)
+def _digest_of(path: Path) -> str:
+    if not path.exists():
+        raise BadInput(path, found="nothing", needed="the embedded model's weights (make train-embedded)")
+    return file_digest(path)
+
+
+def _filled(model: nn.Module, path: Path) -> nn.Module:
+    from safetensors.torch import load_file
+
+    wanted = model.state_dict()
+    stored = {name: tensor for name, tensor in load_file(path).items() if name in wanted}
+    model.load_state_dict({name: tensor.to(wanted[name].dtype) for name, tensor in stored.items()})
+    return model

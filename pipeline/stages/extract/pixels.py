@@ -1,0 +1,55 @@
+"""crops -> their own pixels, shrunk: the control that any features have to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch.nn.functional import interpolate, pixel_unshuffle
+
+from pipeline.items.features import FeatureMaps
+from pipeline.items.views import Crops
+from pipeline.spec import Positive, Runtime, Spec, spec
+from pipeline.stages.extract.grid import cells_of
+
+
+@spec
+class Pixels(Spec):
+    """Each cell's colours, ``side`` x ``side`` of them, in [-1, 1]: no learning, no invariance."""
+
+    kind: ClassVar[str] = "extract.pixels"
+    version: ClassVar[int] = 1
+    needs_geometry: ClassVar[bool] = False
+    notice: ClassVar[str] = ""
+    model: ClassVar[str] = "pixels"
+    timestep: ClassVar[int] = 0
+
+    side: Positive = 2
+
+    def feature_shape(self, layer: int) -> tuple[int, int, int]:
+        """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
+        return 3 * self.side**2, cells_of(layer), cells_of(layer)
+
+    def load(self, runtime: Runtime) -> PixelsBackbone:
+        """Nothing to load."""
+        return PixelsBackbone(self, runtime)
+
+
+class PixelsBackbone:
+    """A Pixels spec on a device."""
+
+    def __init__(self, spec: Pixels, runtime: Runtime) -> None:
+        self.spec, self.device, self.batch = spec, torch.device(runtime.torch_device()), runtime.batch or 64
+
+    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of the given layers, float32; a cell that is larger than its colours holds their means."""
+        rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
+        image, side = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1, self.spec.side
+        return {layer: pixel_unshuffle(_resized(image, side * cells_of(layer)), side) for layer in layers}
+
+
+def _resized(image: torch.Tensor, size: int) -> torch.Tensor:
+    shrinks = size < image.shape[-1]
+    return interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=shrinks)

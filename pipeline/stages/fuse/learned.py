@@ -1,0 +1,80 @@
+"""query and template features -> one map each, by the head that was trained with the embedded model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.digests import file_digest
+from pipeline.errors import BadInput
+from pipeline.functional.aggregation import Aggregation
+from pipeline.items.features import FusedPair
+from pipeline.spec import Spec, spec
+from pipeline.stages.fuse import Layers, fused
+
+HEAD = Path(__file__).parents[2] / "embedded" / "weights" / "head.safetensors"
+
+
+@spec
+class Learned(Spec):
+    """Descriptors of a trained aggregation of all layers (after Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023).
+
+    Goes with ``extract=embedded extract.weights=learned``, whose features it was trained on, and with no other.
+    """
+
+    kind: ClassVar[str] = "fuse.learned"
+    version: ClassVar[int] = 1
+
+    layers: Layers = (2, 5, 8, 11)
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe, with the digest of the head's weights."""
+        return super().recipe() | {"weights": _digest()}
+
+    def __call__(
+        self,
+        query: Mapping[int, Float[Tensor, "c h w"]],
+        template: Mapping[int, Float[Tensor, "c h w"]],
+        query_mask: Bool[Tensor, "S S"],
+        template_mask: Bool[Tensor, "S S"],
+    ) -> FusedPair:
+        """Fused maps. Raises NoPose for an empty mask, BadInput for features of another model."""
+        head = _head(query[self.layers[0]].device)
+        found = {layer: int(query[layer].shape[0]) for layer in self.layers}
+        if found != head.channels:
+            needed = f"channels {head.channels} of extract=embedded, or fuse=pca for other features"
+            raise BadInput("fuse=learned", found=f"features of {found} channels", needed=needed)
+        with torch.no_grad():
+            maps = {layer: torch.stack([query[layer], template[layer]]).float() for layer in self.layers}
+            pair = head(maps)
+        return fused(pair[0], pair[1], query_mask, template_mask)
+
+
+@lru_cache(maxsize=2)
+def _head(device: torch.device) -> Aggregation:
+    from safetensors.torch import load_file
+
+    _there()
+    state = {name: tensor.float() for name, tensor in load_file(HEAD).items()}
+    layers = (2, 5, 8, 11)
+    channels = {layer: state[f"mix.{k}.weight"].shape[1] for k, layer in enumerate(layers)}
+    head = Aggregation(channels, state["narrow.weight"].shape[0])
+    head.load_state_dict(state)
+    return head.eval().requires_grad_(False).to(device)
+
+
+@lru_cache(maxsize=1)
+def _digest() -> str:
+    _there()
+    return file_digest(HEAD)
+
+
+def _there() -> None:
+    if not HEAD.exists():
+        raise BadInput(HEAD, found="nothing", needed="the embedded model's head (make train-embedded), or fuse=pca")

@@ -1,0 +1,70 @@
+"""The model that ships: from the package, without a network, with its own head."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.errors import BadInput
+from pipeline.items.views import Crops
+from pipeline.spec import Runtime
+from pipeline.stages.extract import embedded
+from pipeline.stages.extract.embedded import Embedded
+from pipeline.stages.fuse.learned import Learned
+
+LAYERS = (2, 5, 8, 11)
+
+
+def crops(count: int) -> Crops:
+    rgb = np.random.default_rng(0).integers(0, 256, (count, 128, 128, 3), dtype=np.uint8)
+    return Crops(rgb, np.ones((count, 128, 128), bool), np.repeat(np.eye(3)[None], count, 0))
+
+
+@pytest.mark.parametrize("weights", ["learned", "pure"])
+def test_features_come_from_the_package(weights):
+    extract = Embedded(weights=weights)
+    maps = extract.load(Runtime(device="cpu"))(crops(2), LAYERS)
+    for layer in LAYERS:
+        assert maps[layer].shape[1:] == extract.feature_shape(layer)
+        assert torch.isfinite(maps[layer]).all()
+    assert extract.model.startswith(f"embedded-{weights}-")
+    assert "not Stable Diffusion's" in extract.notice
+
+
+def test_the_two_sets_of_weights_have_keys_of_their_own():
+    keys = {json.dumps(Embedded(weights=name).recipe()) for name in ("learned", "pure")}
+    assert len(keys) == 2
+
+
+def test_a_template_takes_milliseconds_in_batches():
+    backbone = Embedded().load(Runtime(device="cpu"))
+    backbone(crops(backbone.batch), LAYERS)
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        backbone(crops(backbone.batch), LAYERS)
+        times.append((time.perf_counter() - start) / backbone.batch)
+    # 80 ms on 2 idle cores is the promise; tests share theirs, so the fastest of three is held against five times that
+    assert min(times) < 0.4
+
+
+def test_missing_weights_say_how_to_make_them(tmp_path, monkeypatch):
+    embedded.shipped_config.cache_clear()
+    monkeypatch.setattr(embedded, "FOLDER", tmp_path)
+    with pytest.raises(BadInput, match="make train-embedded"):
+        Embedded().feature_shape(2)
+    embedded.shipped_config.cache_clear()
+
+
+def test_the_head_fuses_both_sides_alike_and_refuses_other_features():
+    maps = Embedded().load(Runtime(device="cpu"))(crops(1), LAYERS)
+    one = {layer: m[0] for layer, m in maps.items()}
+    mask = torch.ones(128, 128, dtype=torch.bool)
+    pair = Learned()(one, one, mask, mask)
+    torch.testing.assert_close(pair.query, pair.template)
+    assert pair.query.shape[-1] == 32
+    other = {layer: m[:3] for layer, m in one.items()}
+    with pytest.raises(BadInput, match=r"needs channels .* of extract=embedded"):
+        Learned()(other, other, mask, mask)
