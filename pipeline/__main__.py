@@ -126,6 +126,8 @@ def _job(config: DictConfig, *, sweeping: bool) -> None:
     # one plain dict, so that nothing below knows OmegaConf
     values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     if values["step"] == "report":
+        if values["plan"]:
+            raise BadInput("plan=true step=report", found="a step without a plan", needed="plan=false, or another step")
         make_report(values["out"])
         return
     run(

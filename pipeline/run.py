@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
 import cv2
+import numpy as np
 import torch
 from pydantic import Field
 
@@ -19,6 +20,7 @@ from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Target
+from pipeline.metrics.recall import THETAS
 from pipeline.outputs import KEY_DIGITS, Outputs, now
 from pipeline.report.rows import Row, done_row, read_rows, row_id, write_row
 from pipeline.report.scores import scores_table
@@ -129,6 +131,7 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
 
 def _estimate(graph: Graph, options: Options) -> None:
     """Poses, and unless they alone are asked for, their scores; files, pictures and tables of both."""
+    _check_folder(Path(options.out))
     scores = _scores(graph, options)
     theta_max = options.evaluate.theta_max
     outputs = Outputs(
@@ -149,18 +152,34 @@ def _estimate(graph: Graph, options: Options) -> None:
         outputs.write_row(answers, judged, cases)
 
 
+def _check_folder(out: Path) -> None:
+    """Raise BadInput where results could not be written, before anything is computed."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput("out", found=f"{out} ({error.strerror})", needed="a folder to write to") from None
+
+
 def _scores(graph: Graph, options: Options) -> ScoreNodes | None:
     """The node of the run's scores, None where poses alone are asked for or nothing is annotated."""
     data, chosen = graph.run.dataset, options.evaluate
     if options.step == "estimate":
         return None
+    if not np.isclose(THETAS, chosen.theta_max).any():
+        needed = f"one of BOP's thresholds: {', '.join(f'{theta:g}' for theta in THETAS)}"
+        raise BadInput("evaluate.theta_max", found=chosen.theta_max, needed=needed)
     bare = sorted({t.scene_id for t in graph.run.targets if not data.has_ground_truth(t.scene_id)})
     if bare:
         if options.step == "evaluate":
             where = data.root / data.split / f"{bare[0]:06d}"
             raise BadInput(where, found="no scene_gt.json", needed="ground truth to evaluate against, or step=estimate")
         return None
-    models = chosen.models if (data.root / chosen.models).is_dir() else data.models
+    there = (data.root / chosen.models).is_dir()
+    if not there and chosen.models != Evaluate.models:
+        raise BadInput(
+            data.root / chosen.models, found="no such folder", needed="the meshes that evaluate.models names"
+        )
+    models = chosen.models if there else data.models
     scorer = Scorer(data, graph.run.targets, models, vsd_delta_mm=chosen.vsd_delta_mm, with_vsd=chosen.vsd)
     return graph.scores(scorer)
 

@@ -53,6 +53,7 @@ class Scored:
 
     errors: tuple[PoseErrors, ...]
     scores: Scores
+    models: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class Scorer:
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # poses may be anywhere
                 found += [(target, self._find(view, target, rows, estimates)) for target in by_image[image]]
             progress(1)
-        return Scored(tuple(e for _, f in found for e in f.errors), self._scores(found))
+        return Scored(tuple(e for _, f in found for e in f.errors), self._scores(found), self.models)
 
     def _find(
         self,

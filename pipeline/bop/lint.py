@@ -14,6 +14,7 @@ from pipeline.bop.results import COLUMNS, ResultRow, name_parts, scan_results
 
 ORTHONORMAL = 1e-3
 """A rotation further off (written with three decimals, say) is a note; off ROTATION_TOLERANCE it is a fault."""
+_FARTHEST_MM = 1e6
 _METRES_MM = 20.0  # a median distance below it is one in metres: no camera sees an object 2 cm away
 
 
@@ -51,6 +52,9 @@ def lint(path: Path, data: Dataset | None) -> Lint:
 
 
 def _units(path: Path, rows: Sequence[ResultRow]) -> list[str]:
+    largest = max(float(np.abs(row.T_cam_obj[:3, 3]).max()) for row in rows)
+    if largest > _FARTHEST_MM:
+        return [f"{path}, field t: found {largest:.3g}, needs millimetres: no camera sees an object that far"]
     distance = float(np.median([np.linalg.norm(row.T_cam_obj[:3, 3]) for row in rows]))
     if distance < _METRES_MM:
         return [f"{path}, field t: found a median distance of {distance:.3g}, needs millimetres (it looks like metres)"]
@@ -62,7 +66,7 @@ def _precision(rows: Sequence[ResultRow]) -> list[str]:
     behind = sum(row.T_cam_obj[2, 3] <= 0 for row in rows)
     notes = []
     if (off > ORTHONORMAL).any():
-        notes.append(f"R of {(off > ORTHONORMAL).sum()} rows is orthonormal to {off.max():.2g} only: write more digits")
+        notes.append(f"R of {(off > ORTHONORMAL).sum()} rows is orthonormal to {off.max():.2g} only (few digits?)")
     if behind:
         notes.append(f"{behind} poses lie behind the camera")
     return notes

@@ -72,7 +72,11 @@ class ScoreNodes:
         self.run.tally.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
         errors = tuple(errors_of(record) for record in entry.document["errors"])
         templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
-        return Judged(Scored(errors, scores_of(entry.document["scores"])), _by_answer(answers, errors), templates)
+        return Judged(
+            Scored(errors, scores_of(entry.document["scores"]), self.scorer.models),
+            _by_answer(answers, errors),
+            templates,
+        )
 
     def _make(self, answers: Sequence[Answer]) -> None:
         start = time.perf_counter()

@@ -54,15 +54,29 @@ def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, 
 
 
 def base_of(rows: Sequence[Row]) -> Row:
-    """The run that most others are a step away from; of equals one that was no job of a sweep, or else the first."""
+    """The run that most others are a step away from; of equals one that was no job of a sweep, or else the first.
+
+    Never one with an oracle or with parts switched off, as long as there is another.
+    """
+    rows = [row for row in rows if is_plain(row)] or rows
     asked = [settings(row) for row in rows]
     near = [sum(len(difference(mine, other)) == 1 for other in asked) for mine in asked]
     return rows[max(range(len(rows)), key=lambda i: (near[i], bool(rows[i].config), not rows[i].sweep, -i))]
 
 
+def is_oracle(row: Row) -> bool:
+    """Whether any stage of a run was shown the truth."""
+    return "oracle" in row.label.values() or row.label.get("extract") == "coordinates"
+
+
+def is_plain(row: Row) -> bool:
+    """Whether a run is the method as it is: no oracle, nothing switched off by a variation."""
+    return not is_oracle(row) and row.config.get("variation", "none") == "none"
+
+
 def families(rows: Sequence[Row]) -> list[Family]:
     """All families of rows of one dataset, the widest base first. Rows of switched-off or oracle parts are left out."""
-    left = [row for row in rows if row.config and row.config.get("variation", "none") == "none"]
+    left = [row for row in rows if row.config and is_plain(row)]
     left = list({str(settings(row)): row for row in reversed(left)}.values())[::-1]
     found: list[Family] = []
     while len(left) > 1 and len(found) < MOST_FAMILIES:

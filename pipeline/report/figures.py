@@ -219,7 +219,7 @@ def family_figure(family: Family) -> Figure:
 @mpl.rc_context(STYLE)
 def times_figure(rows: Mapping[str, Row]) -> Figure:
     """Median seconds of a target by stage, one bar a run."""
-    canvas, axes = _canvas(height=max(2.0, 0.9 + 0.34 * len(rows)))
+    canvas, axes = _canvas(height=max(2.2, 1.3 + 0.34 * len(rows)))
     stages = list(dict.fromkeys(stage for row in rows.values() for stage in row.times_s))
     left = np.zeros(len(rows))
     for stage, colour in zip(stages, (*COLOURS, GREY, "#b8bcc4", "#6b4c9a"), strict=False):
@@ -230,7 +230,7 @@ def times_figure(rows: Mapping[str, Row]) -> Figure:
     axes.invert_yaxis()
     axes.set(xlabel="median seconds of a target")
     axes.grid(axis="y", visible=False)
-    _legend(axes, columns=3, below=True)
+    canvas.legend(loc="outside lower center", ncols=4, columnspacing=1.2, handlelength=1, fontsize=8)
     return Figure("times", "Where the time of a target goes, by stage.", canvas)
 
 
@@ -266,10 +266,6 @@ def _two_panels() -> tuple[Canvas, Any]:
     return canvas, canvas.subplots(2, 1, sharex=True, height_ratios=(1.6, 1))
 
 
-def _legend(axes: Axes, *, columns: int = 1, below: bool = False) -> None:
-    if not axes.get_legend_handles_labels()[0]:
-        return
-    if below:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.28), ncols=columns, columnspacing=1.2, handlelength=1)
-    else:
-        axes.legend(ncols=columns)
+def _legend(axes: Axes) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend()

@@ -15,7 +15,7 @@ import PIL.Image
 
 from pipeline.items.scores import Scores
 from pipeline.report import figures, tables
-from pipeline.report.families import Family, base_of, families
+from pipeline.report.families import Family, base_of, families, is_oracle
 from pipeline.report.figures import Figure, ar_interval, ar_name
 from pipeline.report.rows import Row
 from pipeline.report.tables import Table, run_name
@@ -66,9 +66,15 @@ class Section:
         return base_of(self.rows)
 
     @cached_property
+    def comparable(self) -> list[Row]:
+        """The runs whose recall means the same as the base run's: all with VSD, or all without."""
+        without = _scored(self.base).vsd is None
+        return [row for row in self.rows if (_scored(row).vsd is None) == without]
+
+    @cached_property
     def best(self) -> Row:
         """The run with the highest recall; oracles, which see the truth, are no candidates."""
-        honest = [row for row in self.rows if not _is_oracle(row)] or list(self.rows)
+        honest = [row for row in self.comparable if not is_oracle(row)] or [self.base]
         return max(honest, key=lambda row: ar_interval(_scored(row)).mean)
 
     @cached_property
@@ -100,15 +106,15 @@ class Section:
     def methods(self) -> list[tuple[str, Row]]:
         """One run of each method, the base run's first, of each the one nearest to it."""
         chosen = {self.base.method: self.base}
-        for row in sorted(self.rows, key=lambda row: len(run_name(row, self.base))):
-            if not _is_oracle(row):
+        for row in sorted(self.comparable, key=lambda row: len(run_name(row, self.base))):
+            if not is_oracle(row):
                 chosen.setdefault(row.method, row)
         return list(chosen.items())[:_METHODS_SHOWN]
 
     @cached_property
     def families(self) -> list[Family]:
         """The ablations."""
-        return families(self.rows)
+        return families(self.comparable)
 
     def name(self, row: Row) -> str:
         """A run by what sets it apart."""
@@ -273,10 +279,6 @@ def _summary(sections: Sequence[Section], failed: Sequence[Row], folder: Path) -
     lines += [f"failed: {' '.join(row.overrides)} ({row.error})" for row in failed]
     lines.append(f"page      {folder / 'index.html'}\nfigures   {folder / 'figures'}\ntables    {folder / 'tables'}")
     return "\n".join(lines)
-
-
-def _is_oracle(row: Row) -> bool:
-    return "oracle" in row.label.values() or row.label.get("extract") == "coordinates"
 
 
 def _scored(row: Row) -> Scores:

@@ -111,7 +111,16 @@ def read_rows(out: Path) -> list[Row]:
     paths = sorted((out / FOLDER).glob("*.json"))
     if not paths:
         raise BadInput(out / FOLDER, found="no row", needed="the rows of runs: run step=all (or evaluate) first")
-    return sorted((read_row(path) for path in paths), key=lambda row: (row.at, row.id))
+    rows, faults = [], []
+    for path in paths:
+        try:
+            rows.append(read_row(path))
+        except BadInput as fault:
+            faults.append(fault)
+    if faults:
+        more = f"; {len(faults) - 1} other files of {len(paths)} likewise" if len(faults) > 1 else ""
+        raise BadInput(faults[0].where, found=faults[0].found + more, needed=faults[0].needed)
+    return sorted(rows, key=lambda row: (row.at, row.id))
 
 
 def _record(row: Row) -> dict[str, Any]:
@@ -123,7 +132,29 @@ def _record(row: Row) -> dict[str, Any]:
     return plain
 
 
+_TEXTS = ("id", "status", "at", "method", "error", "sweep", "notice", "run", "folder", "csv")
+_MAPS = ("config", "label", "counts", "times_s", "metrics")
+
+
+def _check_types(record: Mapping[str, Any]) -> None:
+    """Raise TypeError for a field that is there with another type than a report works with."""
+    for name in _TEXTS:
+        if not isinstance(record.get(name, ""), str):
+            raise TypeError(f"{name} is no text")
+    for name in _MAPS:
+        if not isinstance(record.get(name, {}), dict):
+            raise TypeError(f"{name} is no JSON object")
+    for name in ("estimates", "bytes_per_object"):
+        if not isinstance(record.get(name, 0), (int, float)):
+            raise TypeError(f"{name} is no number")
+    if not all(isinstance(count, dict) and {"computed", "reused"} <= set(count) for count in record["counts"].values()):
+        raise TypeError("counts lack computed and reused")
+    if not all(isinstance(seconds, (int, float)) for seconds in record["times_s"].values()):
+        raise TypeError("times_s holds what is no number")
+
+
 def _row(record: dict[str, Any]) -> Row:
+    _check_types(record)
     dataset = record.pop("dataset")
     cases = tuple(Case(**case) for case in record.pop("cases"))
     scores = record.pop("scores")

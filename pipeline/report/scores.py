@@ -33,10 +33,11 @@ def scores_table(scored: Scored, *, theta_max: float = 0.5) -> str:
     for name in ("AR", "AR_VSD", "AR_MSSD", "AR_MSPD"):
         if name in spread:
             lines.append(f"  {name} 95 % interval over images: {spread[name].low:.3f} to {spread[name].high:.3f}")
-    for obj_id, mine in by_object(scores).items():
+    for obj_id, mine in by_object(scores, theta_max=theta_max).items():
         lines.append(_line(f"object {obj_id}", mine, f"{int((scores.obj_id == obj_id).sum())} instances"))
-    for (low, high), (count, mine) in by_visibility(scores).items():
+    for (low, high), (count, mine) in by_visibility(scores, theta_max=theta_max).items():
         lines.append(_line("visible", mine, f"{low:.0%} to {high:.0%}, {count} instances"))
+    lines.append(f"errors on the meshes of {scored.models}")
     if scores.no_vsd:
         lines.append(f"VSD, and with it AR, is not available: {scores.no_vsd}")
         lines.append(f"mean of AR_MSSD and AR_MSPD: {recall.mssd_mspd:.4f}")
@@ -63,10 +64,10 @@ def summary_of(scored: Scored, *, theta_max: float = 0.5) -> dict[str, Any]:
         "no_vsd": scores.no_vsd,
         "instances": len(scores),
         "intervals_95": {name: [i.low, i.high] for name, i in intervals(scored, theta_max=theta_max).items()},
-        "objects": {str(obj_id): metrics_of(mine) for obj_id, mine in by_object(scores).items()},
+        "objects": {str(obj_id): metrics_of(mine) for obj_id, mine in by_object(scores, theta_max=theta_max).items()},
         "visibility": [
             {"from": low, "to": high, "instances": count, **metrics_of(mine)}
-            for (low, high), (count, mine) in by_visibility(scores).items()
+            for (low, high), (count, mine) in by_visibility(scores, theta_max=theta_max).items()
         ],
         "recall_by_threshold": {name: found.tolist() for name, found in recall_by_threshold(scores).items()},
     }

@@ -15,7 +15,7 @@ from pipeline.metrics.bootstrap import Interval, image_index, paired_interval
 from pipeline.metrics.recall import instance_ar, instance_recalls
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.report import published
-from pipeline.report.families import Family, difference, settings
+from pipeline.report.families import Family, difference, is_oracle, settings
 from pipeline.report.figures import ar_interval, value_text
 from pipeline.report.rows import Row
 from pipeline.tally import human
@@ -70,9 +70,12 @@ def _run(row: Row, base: Row) -> tuple[str, ...]:
     scores, spread = _scores(row), ar_interval(_scores(row))
     recalls = instance_recalls(scores).mean(axis=0) if len(scores) else np.full(3, np.nan)
     angles = template_angles(row, "geodesic")
+    ar = f"{_number(spread.mean)} ({_number(spread.low)} to {_number(spread.high)})"
+    if scores.vsd is None and _scores(base).vsd is not None:
+        ar = f"{NONE}; AR_MSSD+MSPD {_number(spread.mean)}"
     return (
         run_name(row, base),
-        f"{_number(spread.mean)} ({_number(spread.low)} to {_number(spread.high)})",
+        ar,
         "base" if row.id == base.id else signed(paired(row, base)),
         *map(_number, recalls),
         _number(acc15(row, "geodesic")),
@@ -154,12 +157,17 @@ def _one_method(rows: Sequence[Row], variation: str) -> list[Row]:
     def fixed(row: Row) -> dict[str, object]:
         return {k: v for k, v in settings(row).items() if k.split(".")[0] not in switched}
 
-    mine = [row for row in rows if fixed(row) == fixed(newest)]
+    mine = [row for row in rows if fixed(row) == fixed(newest) and _same_metric(row, newest)]
+    mine = [row for row in mine if not is_oracle(row) or row.label.get("detect", "gt_mask") == "gt_mask"]
     plain = [row for row in mine if row.config.get("variation", "none") == "none"]
     special = [row for row in mine if row.config.get("variation", "none") != "none"]
     asked = settings(newest)
     nearest = sorted(plain, key=lambda row: len(difference(asked, settings(row))))[:1]
     return [*special, *nearest]
+
+
+def _same_metric(ours: Row, theirs: Row) -> bool:
+    return (_scores(ours).vsd is None) == (_scores(theirs).vsd is None)
 
 
 def improvement_table(methods: Sequence[tuple[str, Row]]) -> Table | None:
@@ -233,10 +241,11 @@ def run_name(row: Row, base: Row) -> str:
     if row.id == base.id or not row.config:
         return row.method
     variation = row.config.get("variation", "none")
-    if variation != base.config.get("variation", "none"):
-        other = "" if row.method == base.method else f" {row.method}"
-        return f"{variation.replace('_', ' ')}{other}"
     changed = difference(settings(base), settings(row))
+    if variation not in ("none", base.config.get("variation", "none")):
+        parts = ("fuse", "cluster", "correspond", "match", "detect")  # what variations set
+        rest = [f"{k}={value_text(v)}" for k, v in changed.items() if k.split(".")[0] not in parts]
+        return " ".join([variation.replace("_", " "), *([] if row.method == base.method else [row.method]), *rest])
     bound = (row.config.get("evaluate") or {}).get("theta_max", 0.5)
     told = [f"{name}={value_text(value)}" for name, value in changed.items()]
     told += [f"theta_max={bound:g}"] if bound != 0.5 else []

@@ -126,6 +126,25 @@ def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
     assert f"{60 - shown} pictures are not in this page" in text
 
 
+def test_an_oracle_is_never_the_base_nor_the_best_and_always_named(tmp_path):
+    oracle = {"_target_": "pipeline.stages.match.oracle.Oracle", "layer": 2, "top_k": 1}
+    shown = [toy_row(0.9, variation="oracle_template", match=oracle), toy_row(0.95, match=oracle), toy_row(0.4)]
+    section = Section(shown, "demo")
+    assert section.base is shown[2]
+    assert section.best is shown[2]
+    assert [section.name(row) for row in shown] == ["oracle template", "match=oracle", "dzop-hog"]
+
+
+def test_a_run_without_vsd_has_no_ar_beside_runs_that_have_one():
+    with_vsd, without = toy_row(0.4), toy_row(0.9, vsd=False, cluster__count=40)
+    section = Section([with_vsd, without], "demo")
+    assert section.best is with_vsd
+    assert section.families == []
+    table = section.tables()["runs"][0]
+    told = {row[0]: row[1] for row in table.rows}
+    assert told["cluster.count=40"].startswith("n/a; AR_MSSD+MSPD 0.")
+
+
 def test_rows_on_disk_make_the_page(rows, tmp_path):
     for row in (rows[0], rows[-1]):
         write_row(tmp_path, row)

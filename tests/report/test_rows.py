@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,23 @@ def test_a_broken_row_is_named(tmp_path, text):
     path.parent.mkdir()
     path.write_text(text)
     with pytest.raises(BadInput, match=r"rows/a\.json: found"):
+        read_rows(tmp_path)
+
+
+@pytest.mark.parametrize("field", ["label", "config", "run", "folder", "counts", "times_s", "method", "id", "metrics"])
+def test_a_field_of_another_type_is_named(tmp_path, field):
+    path = write_row(tmp_path, row())
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {field: [1]}))
+    with pytest.raises(BadInput, match=f"{field} is no"):
+        read_rows(tmp_path)
+
+
+def test_all_broken_rows_are_counted(tmp_path):
+    write_row(tmp_path, row("a"))
+    for name in "bcd":
+        (tmp_path / "rows" / f"{name}.json").write_text("{")
+    with pytest.raises(BadInput, match=r"b\.json: found .*; 2 other files of 4 likewise"):
         read_rows(tmp_path)
 
 
