@@ -10,6 +10,8 @@ from pipeline.report.rows import UNTOLD, Row
 
 # the scores of a row hold all thresholds; rows of one section share their targets
 _SAME_SCORES = {"evaluate", "dataset", "select", "method", "variation"}
+# but of these groups, what decides which meshes are rendered and which scores come out
+_MESHES = {"dataset": ("models",), "evaluate": ("models", "vsd_delta_mm")}
 MOST_FAMILIES = 24
 
 
@@ -39,7 +41,15 @@ def settings(row: Row) -> dict[str, Any]:
             found |= {f"{name}.{field}": _plain(v) for field, v in value.items() if field != "_target_"}
         else:
             found[name] = _plain(value)
+    for name, fields in _MESHES.items():
+        group = row.config.get(name) or {}
+        found |= {f"{name}.{field}": group[field] for field in fields if field in group}
     return found
+
+
+def scored_by(row: Row) -> dict[str, Any]:
+    """What poses were held against: two runs that differ in it were not scored alike."""
+    return {name: value for name, value in settings(row).items() if name.startswith("evaluate.")}
 
 
 def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:

@@ -26,7 +26,9 @@ logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells every glyph
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999933")
 GREY = "#8a8f98"
+OF_METRIC = {"vsd": COLOURS[0], "mssd": COLOURS[1], "mspd": COLOURS[2]}
 SIZE = (4.6, 3.1)  # inches
+MOST_BARS = 36  # in one figure; more cannot be told apart on a phone
 STYLE: Any = {
     "font.size": 9,
     "font.family": "sans-serif",
@@ -108,13 +110,24 @@ def ar_name(scores: Scores) -> str:
     return "mean of AR_MSSD and AR_MSPD" if scores.vsd is None else "AR"
 
 
+def ar_head(scores: Scores) -> str:
+    """The same as the head of a table's column."""
+    return "AR_MSSD+MSPD" if scores.vsd is None else "AR"
+
+
 @mpl.rc_context(STYLE)
-def objects_figure(rows: Mapping[str, Row], dataset: str) -> Figure:
-    """Bars of each object's recall for some runs; the paper's beside them where it has this dataset."""
+def objects_figures(rows: Mapping[str, Row], dataset: str) -> list[Figure]:
+    """Bars of each object's recall for some runs, a few objects a figure; the paper's beside them where it has them."""
+    objects = np.unique(_scores(next(iter(rows.values()))).obj_id)
+    bars = len(rows) + len(published.OBJECTS.get(dataset, {}))
+    parts = np.array_split(objects, -(-len(objects) * bars // MOST_BARS)) if len(objects) else [objects]
+    return [_objects_figure(rows, dataset, part.tolist()) for part in parts if len(part) or len(parts) == 1]
+
+
+def _objects_figure(rows: Mapping[str, Row], dataset: str, objects: Sequence[int]) -> Figure:
     first = _scores(next(iter(rows.values())))
-    objects = np.unique(first.obj_id).tolist()
     theirs = published.OBJECTS.get(dataset, {})
-    canvas, axes = _canvas(width=max(SIZE[0], 0.42 * len(objects) * (len(rows) + len(theirs)) / 2))
+    canvas, axes = _canvas()
     bars = len(rows) + len(theirs)
     width = 0.8 / bars
     for k, (name, row) in enumerate(rows.items()):
@@ -126,11 +139,13 @@ def objects_figure(rows: Mapping[str, Row], dataset: str) -> Figure:
     for k, (name, values) in enumerate(theirs.items(), start=len(rows)):
         place = np.arange(len(objects)) + (k - (bars - 1) / 2) * width
         heights = [values.get(obj_id, np.nan) for obj_id in objects]
-        axes.bar(place, heights, width * 0.92, fill=False, edgecolor=GREY, linestyle="--", label=f"{name}, published")
+        told = f"{name}, published AR"
+        axes.bar(place, heights, width * 0.92, fill=False, edgecolor=GREY, linestyle="--", label=told)
     axes.set_xticks(range(len(objects)), [str(obj_id) for obj_id in objects])
     axes.set(xlabel="object", ylabel=_short(first), ylim=(0, 1.02))
-    _legend(axes)
-    return Figure("objects", f"{ar_name(first)} by object, with 95 % intervals over images.", canvas)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, columnspacing=1.2, handlelength=1.4, borderpad=0)
+    of = f"objects {objects[0]} to {objects[-1]}" if len(objects) > 1 else "object"
+    return Figure("objects", f"{ar_name(first)}, {of}, with 95 % intervals over images.", canvas)
 
 
 @mpl.rc_context(STYLE)
@@ -158,8 +173,8 @@ def thresholds_figure(row: Row) -> Figure:
     """Recall at every threshold, by metric."""
     canvas, axes = _canvas()
     names = {"vsd": "VSD (mean over tau)", "mssd": "MSSD, theta of the diameter", "mspd": "MSPD, 100 theta px"}
-    for (name, recall), colour in zip(recall_by_threshold(_scores(row)).items(), COLOURS, strict=False):
-        axes.plot(THETAS if name != "mspd" else MSPD_PX / 100, recall, "o-", color=colour, label=names[name])
+    for name, recall in recall_by_threshold(_scores(row)).items():
+        axes.plot(THETAS if name != "mspd" else MSPD_PX / 100, recall, "o-", color=OF_METRIC[name], label=names[name])
     axes.set(xlabel="theta", ylabel="recall", ylim=(0, 1.02))
     _legend(axes)
     return Figure("thresholds", "Recall at each threshold of correctness.", canvas)
@@ -173,13 +188,13 @@ def visibility_figure(row: Row) -> Figure | None:
     if not bins:
         return None
     canvas, axes = _canvas()
-    for k, (name, pick) in enumerate((("VSD", "vsd"), ("MSSD", "mssd"), ("MSPD", "mspd"))):
-        values = [getattr(recall, pick) for _, recall in bins.values()]
+    for k, (name, colour) in enumerate(OF_METRIC.items()):
+        values = [getattr(recall, name) for _, recall in bins.values()]
         if None not in values:
-            axes.bar(np.arange(len(bins)) + (k - 1) * 0.27, values, 0.25, color=COLOURS[k], label=f"AR_{name}")
-    labels = [f"{low:.0%} to {high:.0%}\nn = {count}" for (low, high), (count, _) in bins.items()]
+            axes.bar(np.arange(len(bins)) + (k - 1) * 0.27, values, 0.25, color=colour, label=f"AR_{name.upper()}")
+    labels = [f"{100 * low:.0f} to {100 * high:.0f}\nn = {count}" for (low, high), (count, _) in bins.items()]
     axes.set_xticks(range(len(bins)), labels)
-    axes.set(xlabel="visible part of the instance", ylabel="average recall", ylim=(0, 1.02))
+    axes.set(xlabel="visible part of the instance, %", ylabel="average recall", ylim=(0, 1.02))
     _legend(axes)
     return Figure("visibility", "Average recalls by how much of an instance is visible.", canvas)
 
@@ -254,8 +269,8 @@ def _whiskers(spread: Sequence[Interval]) -> np.ndarray:
     return np.array([[max(i.mean - i.low, 0), max(i.high - i.mean, 0)] for i in spread]).T
 
 
-def _canvas(*, width: float = SIZE[0], height: float = SIZE[1]) -> tuple[Canvas, Any]:
-    canvas = Canvas(figsize=(min(width, 10.0), height), layout="constrained")
+def _canvas(*, height: float = SIZE[1]) -> tuple[Canvas, Any]:
+    canvas = Canvas(figsize=(SIZE[0], height), layout="constrained")
     FigureCanvasAgg(canvas)
     return canvas, canvas.subplots()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,10 +13,11 @@ from pathlib import Path
 
 import jinja2
 import PIL.Image
+from markupsafe import Markup, escape
 
 from pipeline.items.scores import Scores
 from pipeline.report import figures, tables
-from pipeline.report.families import Family, base_of, families, is_oracle
+from pipeline.report.families import Family, base_of, families, is_oracle, scored_by
 from pipeline.report.figures import Figure, ar_interval, ar_name
 from pipeline.report.rows import Row
 from pipeline.report.tables import Table, run_name
@@ -55,9 +57,9 @@ class Section:
     @cached_property
     def rows(self) -> list[Row]:
         """One of the jobs that gave the same scores, such as those that differ in theta_max alone."""
-        kept: dict[tuple[str, str], Row] = {}
+        kept: dict[tuple[str, str, str], Row] = {}
         for row in sorted(self.jobs, key=lambda row: (not row.cases, bool(row.sweep))):
-            kept.setdefault((row.run, row.config.get("variation", "none")), row)
+            kept.setdefault((row.run, row.config.get("variation", "none"), str(scored_by(row))), row)
         return [row for row in self.jobs if row in kept.values()]
 
     @cached_property
@@ -67,9 +69,9 @@ class Section:
 
     @cached_property
     def comparable(self) -> list[Row]:
-        """The runs whose recall means the same as the base run's: all with VSD, or all without."""
-        without = _scored(self.base).vsd is None
-        return [row for row in self.rows if (_scored(row).vsd is None) == without]
+        """The runs whose recall means the same as the base run's: all with VSD, or all without, on the same meshes."""
+        without, how = _scored(self.base).vsd is None, scored_by(self.base)
+        return [row for row in self.rows if (_scored(row).vsd is None) == without and scored_by(row) == how]
 
     @cached_property
     def best(self) -> Row:
@@ -137,7 +139,7 @@ class Section:
         timed = {self.name(row): row for row in self.rows if row.times_s and self._timed(row)}
         return {
             "recalls": [
-                figures.objects_figure(shown, self.dataset),
+                *figures.objects_figures(shown, self.dataset),
                 figures.theta_figure(shown, self.dataset),
                 figures.thresholds_figure(self.base),
                 *([visible] if visible else []),
@@ -177,7 +179,8 @@ def write_report(rows: Sequence[Row], out: Path) -> Report:
         drawn, told = section.figures(), section.tables()
         _write_files(folder, section, drawn, told)
         galleries = [(section.name(row), pictures.of(row)) for row in section.galleries()]
-        parts.append({"it": section, "figures": drawn, "tables": told, "galleries": galleries})
+        theirs = tables.published_column(section.dataset)
+        parts.append({"it": section, "figures": drawn, "tables": told, "galleries": galleries, "theirs": theirs})
     published = tables.published_tables()
     for table in published:
         _write_table(folder / "tables", table)
@@ -248,7 +251,13 @@ def _template() -> jinja2.Template:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
+    environment.filters["breakable"] = _breakable
     return environment.get_template("page.html.j2")
+
+
+def _breakable(text: str) -> Markup:
+    """A name that may go on in the next line after its dots, underscores and equals signs."""
+    return Markup(re.sub(r"([._=])", r"\1<wbr>", str(escape(text))))
 
 
 def _write_files(folder: Path, section: Section, drawn: dict[str, list[Figure]], told: dict[str, list[Table]]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from pipeline.metrics.recall import instance_ar, instance_recalls
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.report import published
 from pipeline.report.families import Family, difference, is_oracle, settings
-from pipeline.report.figures import ar_interval, value_text
+from pipeline.report.figures import ar_head, ar_interval, value_text
 from pipeline.report.rows import Row
 from pipeline.tally import human
 
@@ -67,7 +67,9 @@ def runs_table(rows: Sequence[Row], base: Row) -> Table:
 
 
 def _run(row: Row, base: Row) -> tuple[str, ...]:
-    scores, spread = _scores(row), ar_interval(_scores(row))
+    scores = _scores(row)
+    alike = scores if _scores(base).vsd is not None else replace(scores, vsd=None)  # the column's head is the base's
+    spread = ar_interval(alike)
     recalls = instance_recalls(scores).mean(axis=0) if len(scores) else np.full(3, np.nan)
     angles = template_angles(row, "geodesic")
     ar = f"{_number(spread.mean)} ({_number(spread.low)} to {_number(spread.high)})"
@@ -105,7 +107,7 @@ def family_table(family: Family) -> Table:
         for value, row in zip(family.values, family.rows, strict=True)
     ]
     name = "ablation_" + family.axis.replace(".", "_")
-    head = (family.axis, "AR" if _scores(family.base).vsd is not None else "AR_MSSD+MSPD", "95 %", "to base, paired")
+    head = (family.axis, ar_head(_scores(family.base)), "95 %", "to base, paired")
     return Table(name, f"Runs that differ in {family.axis} alone.", "measured", head, tuple(body))
 
 
@@ -126,7 +128,8 @@ def correspondence_table(rows: Sequence[Row]) -> Table | None:
             row = by_name[name]
             seconds = f"{sum(row.times_s.values()):.2f}"
             body.append((*("yes" if on else "no" for on in switched), *_point(row), seconds))
-    head = ("co-projection", "clusters", "sub-pixel", "AR", "95 %", "s/target")
+    recall = ar_head(_scores(by_name[next(iter(by_name))]))
+    head = ("co-projection", "clusters", "sub-pixel", recall, "95 %", "s/target")
     return Table("correspondence", "Correspondence estimation.", "measured", head, tuple(body))
 
 
@@ -143,7 +146,7 @@ def ladder_table(rows: Sequence[Row]) -> Table | None:
         gain = "" if before is None else signed(paired(row, before))
         body.append((title, *_point(row), gain))
         before = row
-    head = ("put in", "AR", "95 %", "gain, paired")
+    head = ("put in", ar_head(_scores(shown[0][1])), "95 %", "gain, paired")
     return Table("ladder", "Oracle ladder: where is the loss?", "measured", head, tuple(body))
 
 
@@ -179,9 +182,10 @@ def improvement_table(methods: Sequence[tuple[str, Row]]) -> Table | None:
     for name, row in others:
         error = _relative(_mean(template_angles(row, "geodesic")), _mean(template_angles(ours, "geodesic")), down=True)
         accuracy = _relative(acc15(row, "geodesic"), acc15(ours, "geodesic"))
-        recall = _relative(ar_interval(_scores(row)).mean, ar_interval(_scores(ours)).mean)
-        body.append((f"{our_name} over {name}", error, accuracy, recall, signed(paired(ours, row))))
-    head = ("methods", "pose error", "Acc15", "AR", "AR difference, paired")
+        gain = _relative(ar_interval(_scores(row)).mean, ar_interval(_scores(ours)).mean)
+        body.append((f"{our_name} over {name}", error, accuracy, gain, signed(paired(ours, row))))
+    recall = ar_head(_scores(ours))
+    head = ("methods", "pose error", "Acc15", recall, f"{recall} difference, paired")
     caption = "Relative improvements; pose error is the mean geodesic angle of the matched template."
     return Table("improvement", caption, "measured", head, tuple(body))
 
@@ -234,6 +238,16 @@ def published_tables() -> list[Table]:
         Table("published_improvement", "Relative improvement of DZOP over ZS6D.", "published",
               ("dataset", "pose error", "Acc15", "AR"), gains),
     ]  # fmt: skip
+
+
+def published_column(dataset: str) -> Table | None:
+    """The paper's AR of every method on one dataset; None where the paper does not have it."""
+    if dataset not in published.DATASETS:
+        return None
+    methods = tuple((m.name, m.training, f"{m.ar[dataset]:.3f}") for m in published.METHODS)
+    name = published.DATASETS[dataset]
+    return Table(f"published_{dataset}", f"AR of single-shot methods on {name}, the paper's data and detections.",
+                 "published", ("method", "training", "AR"), methods)  # fmt: skip
 
 
 def run_name(row: Row, base: Row) -> str:

@@ -52,3 +52,11 @@ def test_a_list_of_layers_is_a_value():
     (family,) = families([toy_row(), toy_row(fuse__layers=[8])])
     assert family.axis == "fuse.layers"
     assert set(family.values) == {(2, 5, 8, 11), (8,)}
+
+
+def test_runs_scored_on_other_meshes_or_of_other_meshes_are_not_the_same_run():
+    base = toy_row(evaluate={"theta_max": 0.5, "models": "models_eval"})
+    other = toy_row(evaluate={"theta_max": 0.1, "models": "models"})
+    assert difference(settings(base), settings(other)) == {"evaluate.models": "models"}
+    cad, scanned = (toy_row(dataset={"name": "tless", "models": models}) for models in ("cad", "reconst"))
+    assert difference(settings(cad), settings(scanned)) == {"dataset.models": "reconst"}

@@ -8,7 +8,7 @@ from PIL import Image
 from toy_rows import failed_row, toy_row
 
 from pipeline.errors import BadInput
-from pipeline.report.page import Section, sections_of, write_report
+from pipeline.report.page import Section, _breakable, sections_of, write_report
 from pipeline.report.rows import Case, read_rows, write_row
 
 LIMIT_BYTES = 15_000_000
@@ -96,6 +96,27 @@ def test_missing_vsd_is_told_and_never_a_zero(tmp_path):
     text = page([toy_row(vsd=False)], tmp_path)
     assert "VSD, and with it BOP's AR, is not available: no depth" in re.sub(r"&#39;", "'", text)
     assert ">n/a<" in text
+
+
+def test_a_run_scored_on_other_meshes_is_shown_by_name_and_never_the_best():
+    base = toy_row(0.5, evaluate={"models": "models_eval"})
+    easier = toy_row(0.9, evaluate={"models": "models"})
+    section = Section([base, toy_row(0.4, evaluate={"models": "models_eval"}, cluster__count=40), easier], "demo")
+    assert section.best is base
+    assert section.name(easier) == "evaluate.models=models"
+    twins = [base, replace(easier, run=base.run)]
+    assert len(Section(twins, "demo").rows) == 2
+
+
+def test_published_recalls_of_a_dataset_stand_beside_its_runs_marked_so(tmp_path):
+    text = page([toy_row(name="lmo")], tmp_path)
+    own = text[: text.index('<section id="published">')]
+    assert own.count("AR of single-shot methods on LM-O") == 2  # caption and its label
+    assert "AR of single-shot methods on" not in page([toy_row()], tmp_path)
+
+
+def test_long_names_break_between_their_parts():
+    assert str(_breakable("correspond.per_cluster=<3>")) == "correspond.<wbr>per_<wbr>cluster=<wbr>&lt;3&gt;"
 
 
 def test_rows_of_failures_alone_and_of_a_csv_still_make_a_page(tmp_path):

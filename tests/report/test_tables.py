@@ -4,6 +4,7 @@ import io
 import pytest
 from toy_rows import toy_row
 
+from pipeline.metrics.recall import average_recall
 from pipeline.report import published, tables
 from pipeline.report.families import families
 from pipeline.report.figures import ar_interval
@@ -29,6 +30,33 @@ def test_without_vsd_the_mean_of_two_is_not_called_ar():
     assert "AR" not in told
     assert told["AR_VSD"] == "n/a"
     assert "AR_MSSD+MSPD" in told
+
+
+def test_a_run_with_vsd_among_runs_without_shows_the_mean_of_two_under_that_name():
+    base, other = toy_row(vsd=False), toy_row(cluster__count=40)
+    (_, told) = sorted(columns(tables.runs_table([base, other], base)), key=lambda row: row["run"], reverse=True)
+    assert told["run"] == "cluster.count=40"
+    assert told["AR_MSSD+MSPD"].split()[0] == f"{average_recall(other.scores).mssd_mspd:.3f}"
+
+
+def test_no_table_calls_the_mean_of_two_ar():
+    concat = {"_target_": "pipeline.stages.fuse.concat.Concat"}
+    oracle = {"_target_": "pipeline.stages.match.oracle.Oracle"}
+    rows = [
+        toy_row(vsd=False),
+        toy_row(vsd=False, variation="no_coprojection", fuse=concat, correspond__kernel=1),
+        toy_row(vsd=False, variation="oracle_template", match=oracle),
+    ]
+    family = families([rows[0], toy_row(vsd=False, cluster__count=40)])[0]
+    made = [
+        tables.correspondence_table([*rows, toy_row(vsd=False, variation="no_subpixel", correspond__kernel=1)]),
+        tables.ladder_table(rows),
+        tables.improvement_table([("ours", rows[0]), ("theirs", toy_row(vsd=False, method="zs6d"))]),
+        tables.family_table(family),
+    ]
+    for table in made:
+        assert "AR" not in table.head
+        assert "AR_MSSD+MSPD" in table.head
 
 
 def test_runs_on_other_instances_have_no_difference():

@@ -1,0 +1,64 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_rows import toy_row
+
+from pipeline.report import figures
+from pipeline.report.families import families
+
+
+def of_many_objects(count: int):
+    row = toy_row(instances=2 * count)
+    return replace(row, scores=replace(row.scores, obj_id=np.arange(2 * count) % count + 1))
+
+
+def objects_of(figure: figures.Figure) -> list[int]:
+    return [int(label.get_text()) for label in figure.canvas.axes[0].get_xticklabels()]
+
+
+@pytest.mark.parametrize("runs", [1, 7])
+def test_many_objects_are_shared_out_over_figures_of_few_bars(runs):
+    drawn = figures.objects_figures({str(n): of_many_objects(30) for n in range(runs)}, "tless")
+    assert [obj_id for figure in drawn for obj_id in objects_of(figure)] == list(range(1, 31))
+    for figure in drawn:
+        assert len(objects_of(figure)) * (runs + 2) <= figures.MOST_BARS
+        assert tuple(figure.canvas.get_size_inches()) == figures.SIZE
+
+
+def test_published_bars_are_hollow_dashed_and_only_of_their_own_dataset():
+    def published(dataset):
+        (axes,) = figures.objects_figures({"run": toy_row()}, dataset)[0].canvas.axes
+        return [bars for bars in axes.containers if "published" in str(bars.get_label())]
+
+    assert published("demo") == []
+    found = published("lmo")
+    assert [bars.get_label() for bars in found] == ["ZS6D, published AR", "DZOP, published AR"]
+    assert all(not bar.get_fill() and bar.get_linestyle() == "--" for bars in found for bar in bars)
+
+
+def test_the_papers_curve_has_axes_of_its_own_and_other_axes_have_none():
+    known, unknown = (
+        figures.family_figure(families([toy_row(), toy_row(**change)])[0])
+        for change in ({"cluster__count": 40}, {"match__top_k": 5})
+    )
+    measured, published = known.canvas.axes
+    assert "published" in published.get_title(loc="left")
+    assert all(line.get_markerfacecolor() == "white" for line in published.lines)
+    assert all(line.get_linestyle() != "--" for line in measured.lines)
+    assert len(unknown.canvas.axes) == 1
+
+
+def test_a_metric_keeps_its_colour_where_vsd_is_missing():
+    def colours(row):
+        (axes,) = figures.thresholds_figure(row).canvas.axes
+        return {line.get_label()[:4]: line.get_color() for line in axes.lines}
+
+    assert colours(toy_row(vsd=False)).items() < colours(toy_row()).items()
+
+
+def test_a_figure_is_real_text_and_the_same_every_time():
+    first, second = (figures.theta_figure({"run": toy_row()}, "demo").svg() for _ in range(2))
+    assert first == second
+    assert ">published, LM-O<" in first.replace("</tspan>", "")
+    assert "<metadata>" not in first
