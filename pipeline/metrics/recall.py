@@ -15,7 +15,6 @@ TAUS = np.arange(0.05, 0.51, 0.05)
 """Misalignment tolerances of VSD, as parts of the diameter."""
 MSPD_PX = np.arange(5, 51, 5)
 """Upper bounds of MSPD in pixels of an image 640 wide."""
-METRICS = ("vsd", "mssd", "mspd")
 VISIBILITY_BINS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
 
 
@@ -36,11 +35,6 @@ class AverageRecall:
     def mssd_mspd(self) -> float:
         """Mean of AR_MSSD and AR_MSPD: not BOP's AR, and never to be called so."""
         return (self.mssd + self.mspd) / 2
-
-    @property
-    def best(self) -> float:
-        """AR where VSD is available, otherwise the mean of the other two."""
-        return self.mssd_mspd if self.ar is None else self.ar
 
 
 def average_recall(scores: Scores, *, theta_max: float = 0.5) -> AverageRecall:

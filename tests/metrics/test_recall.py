@@ -27,7 +27,7 @@ def test_without_vsd_there_is_no_ar_and_no_zero_in_its_place():
     recall = average_recall(scores(vsd=False))
     assert recall.vsd is None
     assert recall.ar is None
-    assert recall.best == pytest.approx((recall.mssd + recall.mspd) / 2)
+    assert recall.mssd_mspd == pytest.approx((recall.mssd + recall.mspd) / 2)
     assert set(recall_by_threshold(scores(vsd=False))) == {"mssd", "mspd"}
 
 
