@@ -15,13 +15,21 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pipeline.embedded.pictures import Picture, View, photograph, template
-from pipeline.embedded.views import SIZE, VIEWS, Views, make_shard, read_shard
+from pipeline.embedded.views import (
+    CLUSTERS_PER_OBJECT,
+    OBJECTS_PER_SHARD,
+    SIZE,
+    VIEWS,
+    Views,
+    make_shard,
+    read_shard,
+)
 from pipeline.functional.rigid import rotation_angle_deg
 from pipeline.synthetic.parts import Rng
 
-CELLS = 32  # of the finest map
+CELLS = 64  # a side, of descriptors
 QUERIES, TEMPLATES = 2, VIEWS - 1  # of a cluster
-_POINTS = 96  # correspondences of a pair at most
+_POINTS = 48  # correspondences of a pair at most
 _TOLERANCE = 0.03  # of the object's radius: a point this far behind what a template shows there is hidden in it
 
 
@@ -36,64 +44,71 @@ class Source:
     pace: int = 8
     validation: bool = False
 
-    def clusters(self, step: int, count: int) -> tuple[list[list[View]], Rng]:
-        """The clusters of a step, each of another object, and the generator of all its further draws."""
+    def objects(self, step: int, count: int) -> tuple[list[list[list[View]]], Rng]:
+        """All clusters of views of the objects of a step, and the generator of the step's further draws."""
         rng = np.random.default_rng([self.seed, step, 0xBA7C])
         known = min(self.count, self.start + step // self.pace)
         found = []
         for _ in range(count):
             views = _shard(self.folder, int(rng.integers(known)), self.validation)
-            k = int(rng.integers(len(views)))
-            found.append([_unpacked(views, k, v) for v in range(VIEWS)])
+            first = CLUSTERS_PER_OBJECT * int(rng.integers(OBJECTS_PER_SHARD))
+            clusters = range(first, first + CLUSTERS_PER_OBJECT)
+            found.append([[_unpacked(views, k, v) for v in range(VIEWS)] for k in clusters])
         return found, rng
 
 
 @dataclass(frozen=True, eq=False)
 class PairBatch:
-    """b clusters of q queries and t templates. Correspondences of each pair, up to m: cells as (x, y), floats.
+    """b objects, c clusters of each, q queries and t templates of a cluster.
 
-    ``matched`` says which of them are; ``angle_deg`` lies between each query's and template's rotation.
+    Correspondences of each query and template of one cluster, up to m: cells as (x, y), floats; ``matched`` says
+    which of them are. ``angle_deg`` lies between each query's rotation and that of every template of its object.
     """
 
     rgb: UInt8[Tensor, "n S S 3"]
     mask: Bool[Tensor, "n S S"]
-    query_xy: Float[Tensor, "b q t m 2"]
-    template_xy: Float[Tensor, "b q t m 2"]
-    matched: Bool[Tensor, "b q t m"]
-    angle_deg: Float[Tensor, "b q t"]
+    query_xy: Float[Tensor, "b c q t m 2"]
+    template_xy: Float[Tensor, "b c q t m 2"]
+    matched: Bool[Tensor, "b c q t m"]
+    angle_deg: Float[Tensor, "b c q ct"]
 
 
 def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n S S 3"]:
-    """Pictures of all sorts: two in three are photographs."""
-    clusters, rng = source.clusters(step, count)
-    views = [cluster[int(rng.integers(VIEWS))] for cluster in clusters]
+    """Pictures of all sorts, each of another object: two in three are photographs."""
+    objects, rng = source.objects(step, count)
+    views = [clusters[int(rng.integers(len(clusters)))][int(rng.integers(VIEWS))] for clusters in objects]
     made = [photograph(v, rng) if rng.uniform() < 0.67 else template(v, rng) for v in views]
     return torch.from_numpy(np.stack([p.rgb for p in made]))
 
 
 def pair_batch(source: Source, step: int, *, count: int) -> PairBatch:
-    """Clusters with two photographs of the query's view each, and the other views as templates."""
-    clusters, rng = source.clusters(step, count)
+    """Two photographs of the query's view of every cluster of ``count`` objects, and its other views as templates."""
+    objects, rng = source.objects(step, count)
     pictures: list[Picture] = []
-    parts = []
-    for views in clusters:
-        queries = [photograph(views[0], rng) for _ in range(QUERIES)]
-        templates = [template(view, rng) for view in views[1:]]
-        pictures += queries + templates
-        found = [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
-        R = np.stack([view.T[:3, :3] for view in views[1:]]).astype(np.float64)
-        angle = rotation_angle_deg(np.broadcast_to(views[0].T[:3, :3].astype(np.float64), R.shape), R)
-        parts.append((*(np.stack(p) for p in zip(*found, strict=True)), np.stack([angle] * QUERIES)))
-    q, t, ok, angle = (np.stack(p) for p in zip(*parts, strict=True))
-    shape = (len(clusters), QUERIES, TEMPLATES, _POINTS)
+    parts, angles = [], []
+    for clusters in objects:
+        for views in clusters:
+            queries = [photograph(views[0], rng) for _ in range(QUERIES)]
+            pictures += queries + [template(view, rng) for view in views[1:]]
+            parts += [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
+        R_template = _rotations([view for views in clusters for view in views[1:]])
+        for views in clusters:
+            R_query = np.broadcast_to(_rotations(views[:1]), R_template.shape)
+            angles += [rotation_angle_deg(R_query, R_template)] * QUERIES
+    q, t, ok = (torch.from_numpy(np.stack(p)) for p in zip(*parts, strict=True))
+    shape = (count, CLUSTERS_PER_OBJECT, QUERIES, TEMPLATES, _POINTS)
     return PairBatch(
         torch.from_numpy(np.stack([p.rgb for p in pictures])),
         torch.from_numpy(np.stack([p.mask for p in pictures])),
-        torch.from_numpy(q).reshape(*shape, 2),
-        torch.from_numpy(t).reshape(*shape, 2),
-        torch.from_numpy(ok).reshape(shape),
-        torch.from_numpy(angle.astype(np.float32)),
+        q.reshape(*shape, 2),
+        t.reshape(*shape, 2),
+        ok.reshape(shape),
+        torch.from_numpy(np.stack(angles).astype(np.float32)).reshape(*shape[:3], -1),
     )
+
+
+def _rotations(views: list[View]) -> Float[np.ndarray, "n 3 3"]:
+    return np.stack([view.T[:3, :3] for view in views]).astype(np.float64)
 
 
 @lru_cache(maxsize=200)
@@ -119,9 +134,9 @@ def _correspondences(
     cell_xy = np.stack(np.meshgrid(np.arange(CELLS), np.arange(CELLS)), axis=-1).reshape(-1, 2)
     crop_px = (cell_xy + 0.5) * stride - 0.5
     scale, shift = query.A_crop_view[0, 0], query.A_crop_view[:2, 2]
-    px = np.rint((crop_px - shift) / scale).astype(int)
-    inside = (px >= 0).all(1) & (px < SIZE).all(1)
-    x, y = np.where(inside[:, None], px, 0).T
+    px = (crop_px - shift) / scale
+    inside = (px >= 0).all(1) & (px <= SIZE - 1).all(1)
+    x, y = np.rint(np.where(inside[:, None], px, 0)).astype(int).T
     at = np.rint(crop_px).astype(int)
     inside &= query.seen[y, x] & view.mask[y, x] & query.mask[at[:, 1], at[:, 0]]
     other_px, visible = _seen_in(other, _object_points(view, px[inside]))
@@ -133,8 +148,9 @@ def _correspondences(
     return rows[0], rows[1], np.arange(_POINTS) < len(found)
 
 
-def _object_points(view: View, px: np.ndarray) -> Float[np.ndarray, "m 3"]:
-    z = view.depth[px[:, 1], px[:, 0]] + view.T[2, 3]
+def _object_points(view: View, px: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+    x, y = np.rint(px).astype(int).T
+    z = view.depth[y, x] + view.T[2, 3]
     K, T = view.K.astype(np.float64), view.T.astype(np.float64)
     points = np.stack([(px[:, 0] - K[0, 2]) / K[0, 0] * z, (px[:, 1] - K[1, 2]) / K[1, 1] * z, z], axis=-1)
     return (points - T[:3, 3]) @ T[:3, :3]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pipeline.embedded.batches import CELLS, PairBatch
 from pipeline.functional.masks import cell_mask
 
-_BLUR_CELLS = 0.6  # of a correspondence's target: points lie between cells
 _NEAR_DEG = 12.0  # templates about this far off are half as good as the query's own view
 
 
@@ -25,56 +24,66 @@ def reconstruction_loss(
 
 
 def sides(
-    maps: Float[Tensor, "n c h w"], batch: PairBatch
-) -> tuple[Float[Tensor, "b q c h w"], Float[Tensor, "b t c h w"]]:
-    """Maps of queries and of templates, by cluster."""
-    b, q, t = batch.angle_deg.shape
-    by_cluster = maps.unflatten(0, (b, q + t))
-    return by_cluster[:, :q], by_cluster[:, q:]
-
-
-def correspondence_logits(
-    descriptors: Float[Tensor, "n d h w"], batch: PairBatch
-) -> tuple[Float[Tensor, "b q t m k"], Bool[Tensor, "b t k"]]:
-    """Cosines of each query cell in question with all cells of each template, and which of these are foreground."""
-    query, template = sides(normalize(descriptors.float(), dim=1), batch)
-    index = (batch.query_xy[..., 1] * CELLS + batch.query_xy[..., 0]).long()
-    b, q, t, m = index.shape
-    flat = query.flatten(3).transpose(2, 3)  # b q k d
-    asked = flat.gather(2, index.reshape(b, q, t * m, 1).expand(-1, -1, -1, flat.shape[-1])).unflatten(2, (t, m))
-    cosine = torch.einsum("bqtmd,btdk->bqtmk", asked, template.flatten(3))
-    inside = cell_mask(batch.mask, cells=CELLS).flatten(1).unflatten(0, (b, q + t))[:, q:]
-    return cosine, inside
+    maps: Float[Tensor, "n d h w"], batch: PairBatch
+) -> tuple[Float[Tensor, "b c q d h w"], Float[Tensor, "b c t d h w"]]:
+    """Maps of queries and of templates, by object and cluster."""
+    b, c, q, t = batch.matched.shape[:4]
+    by_cluster = maps.unflatten(0, (b, c, q + t))
+    return by_cluster[:, :, :q], by_cluster[:, :, q:]
 
 
 def correspondence_loss(
-    cosine: Float[Tensor, "b q t m k"], inside: Bool[Tensor, "b t k"], batch: PairBatch, scale: Tensor
+    descriptors: Float[Tensor, "n d h w"], batch: PairBatch, scale: Tensor
 ) -> Float[Tensor, ""]:
-    """Cross entropy over a template's foreground cells, against a Gaussian round the true place (InfoNCE)."""
-    logits = (cosine * scale).masked_fill(~inside[:, None, :, None], -1e4)
-    k = torch.arange(CELLS * CELLS)
-    xy = torch.stack([k % CELLS, k // CELLS], dim=-1).float()
-    distance = (batch.template_xy[..., None, :] - xy).square().sum(-1)
-    target = torch.exp(-distance / (2 * _BLUR_CELLS**2)) * inside[:, None, :, None]
-    total = target.sum(-1)
-    usable = batch.matched & (total > 0.1)
-    loss = -(target * logits.log_softmax(-1)).sum(-1) / total.clamp(min=0.1)
-    return (loss * usable).sum() / usable.sum().clamp(min=1)
+    """Cross entropy of a query cell's cosines over a template's foreground cells (InfoNCE).
+
+    The target is spread over the four cells about the true place, as bilinear interpolation would; correspondences
+    with less than half of that in the foreground do not count.
+    """
+    query, template = (maps.flatten(0, 1) for maps in sides(normalize(descriptors.float(), dim=1), batch))
+    xy = batch.query_xy.flatten(0, 1)
+    g, q, t, m = xy.shape[:4]  # g: clusters of all objects
+    flat = query.flatten(3).transpose(2, 3)  # g q k d
+    asked = flat.gather(2, _index(xy).reshape(g, q, t * m, 1).expand(-1, -1, -1, flat.shape[-1]))
+    asked = scale * asked.unflatten(2, (t, m)).transpose(1, 2).reshape(g * t, q * m, -1)
+    inside = cell_mask(batch.mask, cells=CELLS).flatten(1).unflatten(0, (g, q + t))[:, q:].reshape(g * t, 1, -1)
+    logits = torch.baddbmm(torch.where(inside, 0.0, -1e4), asked, template.reshape(g * t, -1, CELLS * CELLS))
+
+    place, weight = _bilinear(batch.template_xy.flatten(0, 1).transpose(1, 2).reshape(g * t, q * m, 2))
+    weight = weight * inside.expand(-1, q * m, -1).gather(2, place)
+    total = weight.sum(-1)
+    usable = batch.matched.flatten(0, 1).transpose(1, 2).reshape(g * t, q * m) & (total > 0.5)
+    hit = (weight * logits.gather(2, place)).sum(-1) / total.clamp(min=0.5)
+    return ((logits.logsumexp(-1) - hit) * usable).sum() / usable.sum().clamp(min=1)
 
 
-def retrieval_scores(maps: Float[Tensor, "n c h w"], batch: PairBatch) -> Float[Tensor, "b q t"]:
+def _index(xy: Float[Tensor, "*n 2"]) -> Int64[Tensor, "*n"]:
+    return (xy[..., 1] * CELLS + xy[..., 0]).long()
+
+
+def _bilinear(xy: Float[Tensor, "*n 2"]) -> tuple[Int64[Tensor, "*n 4"], Float[Tensor, "*n 4"]]:
+    """The four cells about each place, and their weights."""
+    xy = xy.clamp(0, CELLS - 1.001)
+    low = xy.floor()
+    part = xy - low
+    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    weight = (1 - corners - part[..., None, :]).abs().prod(-1)
+    return _index(low[..., None, :] + corners), weight
+
+
+def retrieval_scores(maps: Float[Tensor, "n d h w"], batch: PairBatch) -> Float[Tensor, "b c q ct"]:
     """As ``match=masked_cosine`` does: cosines cell by cell inside both masks, over the cells inside either."""
     query, template = sides(normalize(maps.float(), dim=1), batch)
-    b, q, t = batch.angle_deg.shape
-    inside = cell_mask(batch.mask, cells=maps.shape[-1]).unflatten(0, (b, q + t))
-    of_query, of_template = inside[:, :q, None], inside[:, None, q:]
-    cosine = torch.einsum("bqchw,btchw->bqthw", query, template)
+    of_query, of_template = sides(cell_mask(batch.mask, cells=maps.shape[-1])[:, None], batch)
+    template, of_template = template.flatten(1, 2)[:, None, None], of_template.flatten(1, 2)[:, None, None, :, 0]
+    query, of_query = query[:, :, :, None], of_query[:, :, :, None, 0]
+    cosine = (query * template).sum(-3)
     both, either = of_query & of_template, of_query | of_template
     return (cosine * both).sum((-2, -1)) / either.sum((-2, -1)).clamp(min=1)
 
 
 def retrieval_loss(
-    scores: Float[Tensor, "b q t"], angle_deg: Float[Tensor, "b q t"], scale: Tensor
+    scores: Float[Tensor, "b c q ct"], angle_deg: Float[Tensor, "b c q ct"], scale: Tensor
 ) -> Float[Tensor, ""]:
     """Cross entropy over an object's templates, against weights that fall with the angle to the query's view."""
     target = torch.softmax(-0.5 * (angle_deg / _NEAR_DEG) ** 2, dim=-1)

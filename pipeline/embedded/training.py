@@ -54,7 +54,7 @@ class Plan:
     shards: int = 150
     autoencoder: int = 500
     denoiser: int = 400
-    descriptors: int = 1450
+    descriptors: int = 4000
     seed: int = 0
 
 
@@ -170,8 +170,8 @@ class Descriptors(Stage):
         return Described(unet)
 
     def loss(self, step: int) -> dict[str, Tensor]:
-        """Both losses of 4 clusters of 8 pictures."""
-        batch = pair_batch(self.source, step, count=4)
+        """Both losses of 2 objects' 2 clusters of 8 pictures."""
+        batch = pair_batch(self.source, step, count=2)
         return described_losses(self.model, self.encode(batch.rgb), batch)
 
 
@@ -188,18 +188,17 @@ class Described(nn.Module):
         """Descriptors, and the maps that templates are chosen by."""
         with _mixed():
             maps = decoder_maps(self.unet, latent, TIMESTEP, prompt(1), layers=LAYERS, hook="pre")
-        maps = {k: m.float() for k, m in maps.items()}
-        return self.head(maps), maps[MATCH_LAYER]
+            maps = {k: m.float() for k, m in maps.items()}
+            return self.head(maps), maps[MATCH_LAYER]
 
 
 def described_losses(model: Described, latent: Tensor, batch: Any) -> dict[str, Tensor]:
     """Correspondence and retrieval loss of a batch."""
     descriptors, coarse = model(latent)
     scale = model.log_scale.clamp(max=math.log(60.0)).exp()
-    cosine, inside = losses.correspondence_logits(descriptors, batch)
     scores = losses.retrieval_scores(coarse, batch)
     return {
-        "correspondence": losses.correspondence_loss(cosine, inside, batch, scale[0]),
+        "correspondence": losses.correspondence_loss(descriptors, batch, scale[0]),
         "retrieval": losses.retrieval_loss(scores, batch.angle_deg, scale[1]),
     }
 

@@ -7,13 +7,15 @@ from collections.abc import Mapping, Sequence
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import gelu, interpolate
+from torch.nn.functional import gelu, interpolate, pixel_shuffle
 
 
 class Aggregation(nn.Module):
     """Each layer scaled to cells of unit mean square, mixed by its own matrix, upsampled and added; then one MLP.
 
     Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023, with one timestep and a matrix for a bottleneck of each layer.
+    Then every cell becomes 2x2: what a cell holds of its own inside is learned as a difference to plain interpolation
+    (sub-pixel convolution: Shi et al., CVPR 2016).
     """
 
     def __init__(self, channels: Mapping[int, int], dim: int) -> None:
@@ -22,12 +24,15 @@ class Aggregation(nn.Module):
         self.layers = tuple(channels)
         self.mix = nn.ModuleList([nn.Conv2d(channels[layer], dim, 1) for layer in self.layers])
         self.widen, self.narrow = nn.Conv2d(dim, 2 * dim, 1), nn.Conv2d(2 * dim, dim, 1)
+        self.split = nn.Conv2d(dim, 4 * dim, 3, padding=1)
 
-    def forward(self, maps: Mapping[int, Float[Tensor, "n _c _h _w"]]) -> Float[Tensor, "n d h w"]:
-        """Descriptors at the resolution of the finest layer; their lengths mean nothing."""
+    def forward(self, maps: Mapping[int, Float[Tensor, "n _c _h _w"]]) -> Float[Tensor, "n d 2*h 2*w"]:
+        """Descriptors at twice the resolution of the finest layer; their lengths mean nothing."""
         cells = max(maps[layer].shape[-1] for layer in self.layers)
         total = self._mixed(maps, self.layers, cells)
-        return total + self.narrow(gelu(self.widen(total)))
+        total = total + self.narrow(gelu(self.widen(total)))
+        smooth = interpolate(total, scale_factor=2, mode="bilinear", align_corners=False)
+        return smooth + pixel_shuffle(self.split(gelu(total)), 2)
 
     def _mixed(self, maps: Mapping[int, Tensor], layers: Sequence[int], cells: int) -> Tensor:
         total: Tensor | None = None
