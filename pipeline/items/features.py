@@ -11,6 +11,12 @@ from torch import Tensor
 FeatureMaps = Mapping[int, Float[Tensor, "n c h w"]]
 """layer -> maps of n crops; the map of layer l covers the whole crop with h x w equal cells."""
 
+SALIENCY_LAYER = -1
+"""Where a transformer gives the class token's attention, (1 h w): an extractor that has none knows no such layer."""
+
+CLASS_TOKEN_LAYER = -2
+"""Where a transformer gives its class token, (c 1 1)."""
+
 
 @dataclass(frozen=True, eq=False)
 class FusedPair:
