@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,12 +20,13 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional import camera, rigid
+from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
-from pipeline.items.features import Clusters, FusedPair
+from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
 from pipeline.stages.cluster import Clusterer
-from pipeline.stages.correspond import Corresponder, TruthCorresponder
+from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import Detector
 from pipeline.stages.extract import Extractor
@@ -62,8 +63,9 @@ class Stages:
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Decoder layers the route reads: the template layer and the hyperfeature layers."""
-        return tuple(sorted({self.match.layer, *self.fuse.layers}))
+        """Layers the route reads: the template layer, the hyperfeature layers, saliency where it is needed."""
+        salient = {SALIENCY_LAYER} if isinstance(self.correspond, SalientCorresponder) else set()
+        return tuple(sorted({self.match.layer, *self.fuse.layers} | salient))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +194,9 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
         with clock("read template"):
             template = bank.view(index)
         with clock("fuse"):
-            pair = stages.fuse(query.features, template.features, query.mask, template.mask)
+            pair = _with_saliency(
+                stages.fuse(query.features, template.features, query.mask, template.mask), query, template
+            )
             parts["pair"] = pair
         with clock("cluster"):
             clusters = stages.cluster(pair)
@@ -214,6 +218,15 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
+
+
+def _with_saliency(pair: FusedPair, query: Query, template: TemplateView) -> FusedPair:
+    """The pair with the saliency of its cells, where the extractor was asked for it."""
+    if SALIENCY_LAYER not in query.features:
+        return pair
+    cells = pair.query.shape[-1]
+    seen = [upsample(side.features[SALIENCY_LAYER].float(), cells=cells)[0] for side in (query, template)]
+    return replace(pair, query_saliency=seen[0], template_saliency=seen[1])
 
 
 def _matched(

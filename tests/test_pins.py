@@ -5,6 +5,7 @@ When one of these fails on purpose, raise the variant's ``version`` and write th
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,9 @@ def toy_pair() -> FusedPair:
     fused = variant("fuse/concat")(
         toy_maps(), {k: m.flip(-1) for k, m in toy_maps().items()}, disc(64), disc(64).flip(-1)
     )
-    return fused
+    ramp = torch.linspace(0, 1, fused.query.shape[-1])
+    salient = 0.7 * ramp + 0.3 * ramp[:, None]
+    return replace(fused, query_saliency=salient, template_saliency=salient.flip(-1))
 
 
 def toy_crops() -> Crops:

@@ -20,6 +20,7 @@ from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.items.features import SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.scoring import Scorer
 
@@ -39,14 +40,22 @@ class Graph:
         """Raise BadInput for a device, weights or a layer that are not there, before any work."""
         self.run.runtime.torch_device()
         stages = self.run.stages
-        for where, layers in (("match.layer", (stages.match.layer,)), ("fuse.layers", stages.fuse.layers)):
-            for layer in layers:
-                try:
-                    stages.extract.feature_shape(layer)
-                except BadInput as fault:
-                    if "layer" in fault.where:
-                        raise BadInput(where, found=fault.found, needed=fault.needed) from None
-                    raise
+        asked = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
+        asked[stages.match.layer] = "match.layer"
+        for layer in stages.layers:
+            try:
+                stages.extract.feature_shape(layer)
+            except BadInput as fault:
+                if layer == SALIENCY_LAYER:
+                    needed = (
+                        f"an extractor with saliency (dino, dinov2) for {stages.correspond.kind}, or correspond=cosine"
+                    )
+                    raise BadInput(
+                        "correspond", found=f"{stages.extract.kind} without saliency", needed=needed
+                    ) from None
+                if "layer" in fault.where:
+                    raise BadInput(asked[layer], found=fault.found, needed=fault.needed) from None
+                raise
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""

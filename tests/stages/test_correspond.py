@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -6,6 +8,7 @@ from pipeline.items.features import Clusters, FusedPair
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine
+from pipeline.stages.correspond.salient import Salient
 
 H = 20
 
@@ -99,3 +102,43 @@ def test_nothing_to_match_says_why():
     opposite = FusedPair(torch.ones(4, H, H), -torch.ones(4, H, H), _disc(), _disc())
     with pytest.raises(NoPose, match="correspond: no cells of 1 cluster pairs have a positive cosine"):
         Cosine()(opposite, one, crop_size=80)
+
+
+def _salient_pair(noise: float = 0.3) -> FusedPair:
+    generator = torch.Generator().manual_seed(9)
+    query, template = (torch.rand(H, H, generator=generator) for _ in range(2))
+    return replace(_pair(shift=0.4, noise=noise), query_saliency=query, template_saliency=template)
+
+
+def test_salient_keeps_the_most_salient_mutual_neighbours():
+    pair = _salient_pair()
+    found = Salient(count=1000, threshold=0.3)(pair, One()(pair), crop_size=H)
+    q, t = (m.flatten(1).T / m.flatten(1).norm(dim=0)[:, None] for m in (pair.query, pair.template))
+    sides = [(pair.query_mask & (pair.query_saliency > 0.3)), (pair.template_mask & (pair.template_saliency > 0.3))]
+    rows, columns = (side.flatten().nonzero()[:, 0].tolist() for side in sides)
+    best = {i: max(columns, key=lambda j, i=i: float(q[i] @ t[j])) for i in rows}
+    back = {j: max(rows, key=lambda i, j=j: float(q[i] @ t[j])) for j in columns}
+    buddies = [(i, j) for i, j in best.items() if back[j] == i]
+    saliency = [pair.query_saliency.flatten()[i] + pair.template_saliency.flatten()[j] for i, j in buddies]
+    expected = [buddies[k] for k in torch.stack(saliency).sort(descending=True, stable=True).indices]
+    flat = [
+        (px.double().round() @ torch.tensor([1.0, H], dtype=torch.float64)).long().tolist()
+        for px in (found.query_px, found.template_px)
+    ]
+    assert list(zip(*flat, strict=True)) == expected
+
+
+def test_salient_gives_one_pair_a_group_and_the_same_ones_again():
+    pair = _salient_pair()
+    every = Salient(count=1000)(pair, One()(pair), crop_size=H)
+    few, again = (Salient(count=7)(pair, One()(pair), crop_size=H) for _ in range(2))
+    assert len(few.query_px) == 7
+    assert torch.equal(few.query_px, again.query_px)
+    assert {tuple(px) for px in few.query_px.tolist()} < {tuple(px) for px in every.query_px.tolist()}
+    assert few.query_px[0].tolist() == every.query_px[0].tolist()
+
+
+def test_salient_says_that_nothing_is():
+    pair = replace(_salient_pair(), query_saliency=torch.zeros(H, H))
+    with pytest.raises(NoPose, match="more salient than 0"):
+        Salient()(pair, One()(pair), crop_size=H)
