@@ -72,9 +72,10 @@ class Graph:
         self.onboard()
         return self.poses.estimate()
 
-    def scores(self, scorer: Scorer) -> ScoreNodes:
-        """The node of the poses' scores."""
-        return ScoreNodes(self.run, self.templates, self.poses, scorer)
+    def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
+        """The node of the poses' scores, and with them those of the correspondences they were solved from."""
+        retrace = self.retracer() if correspondences else None
+        return ScoreNodes(self.run, self.templates, self.poses, scorer, retrace)
 
     def retracer(self) -> Retracer:
         """Shows how answers came about."""
