@@ -142,6 +142,8 @@ def _job(config: DictConfig, *, sweeping: bool) -> None:
 def stages_of(values: Mapping[str, Any]) -> Stages:
     """The stages a configuration chooses."""
     chosen = {name: variant(values[name], name) for name in STAGES}
+    if hasattr(chosen["fuse"], "resolve_for"):
+        chosen["fuse"] = chosen["fuse"].resolve_for(chosen["extract"].model)
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
     return Stages(**chosen, fallback=values["fallback"])

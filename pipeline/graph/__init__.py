@@ -23,6 +23,7 @@ from pipeline.graph.templates import TemplateNodes
 from pipeline.items.features import SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.scoring import Scorer
+from pipeline.stages.fuse import TrainedFuser
 
 __all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
 
@@ -40,6 +41,8 @@ class Graph:
         """Raise BadInput for a device, weights or a layer that are not there, before any work."""
         self.run.runtime.torch_device()
         stages = self.run.stages
+        if isinstance(stages.fuse, TrainedFuser):
+            stages.fuse.check(stages.extract.model)
         asked = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
         asked[stages.match.layer] = "match.layer"
         for layer in stages.layers:

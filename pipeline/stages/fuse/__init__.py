@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,6 +31,15 @@ class Fuser(Variant, Protocol):
         template_mask: Bool[Tensor, "S S"],
     ) -> FusedPair:
         """Fused maps at the resolution of the finest layer. Raises NoPose when a mask has no cell."""
+        ...
+
+
+@runtime_checkable
+class TrainedFuser(Protocol):
+    """One that was trained on the features of one model."""
+
+    def check(self, model: str) -> None:
+        """Raise BadInput for features of another ``model`` (an extractor's)."""
         ...
 
 
