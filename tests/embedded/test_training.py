@@ -122,10 +122,13 @@ def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(place, tmp_pa
     names = {path.name for path in (tmp_path / "weights").iterdir()}
     assert names == {
         "config.json",
-        "steps.json",
+        "losses.json",
         "vae.safetensors",
         "unet_pure.safetensors",
         "unet_learned.safetensors",
         "head.safetensors",
     }
     assert size < 25_000_000
+    curves = json.loads((tmp_path / "weights" / "losses.json").read_text())
+    assert [record["step"] for record in curves["denoiser"]] == [0, 1]
+    assert curves["autoencoder"][0]["loss"] == curve(place, "autoencoder")[0]
