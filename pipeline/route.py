@@ -2,7 +2,7 @@
 
 mesh -render-> templates -crop, extract-> template features            (offline, once for every object)
 image -detect, crop, extract-> query features                          (once for every image)
-query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> pose
+query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve, refine-> pose
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pipeline.errors import NoPose
 from pipeline.functional import camera, rigid
 from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
+from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
@@ -33,6 +34,7 @@ from pipeline.stages.extract import Extractor
 from pipeline.stages.fuse import Fuser
 from pipeline.stages.lift import lift
 from pipeline.stages.match import Matcher, TruthMatcher
+from pipeline.stages.refine import Refiner
 from pipeline.stages.render import Renderer
 from pipeline.stages.solve import Solver
 
@@ -51,6 +53,7 @@ class Stages:
     cluster: Clusterer
     correspond: Corresponder
     solve: Solver
+    refine: Refiner
     detect: Detector
     fallback: bool = False
 
@@ -179,6 +182,7 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
     hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
     hypotheses.sort(key=lambda h: -h.inliers)  # stable: equals stay in the order of their templates
+    hypotheses[0] = _refined(stages, query, bank, hypotheses[0], clock)
     return Trace(match, tuple(hypotheses), clock.times_s)
 
 
@@ -235,14 +239,41 @@ def _matched(
     """Corresponding points; the true ones for an oracle."""
     if not isinstance(stages.correspond, TruthCorresponder) or query.truth is None:
         return stages.correspond(pair, clusters, crop_size=stages.crop.size)
+    template_px, points_obj = _template_cells(stages, template, pair)
+    true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
+    true_px = torch.from_numpy(camera.apply(query.A_crop_img, true_px_img)).to(template_px.device)
+    return stages.correspond.by_truth(template_px, true_px, query.mask)
+
+
+def _template_cells(
+    stages: Stages, template: TemplateView, pair: FusedPair
+) -> tuple[Float[Tensor, "m 2"], Float[np.ndarray, "m 3"]]:
+    """Crop pixels and object points (mm, NaN off the object) of the centres of the template's foreground cells."""
     cells = pair.template_mask.shape[-1]
     cell_xy = camera.grid_xy(foreground(pair.template_mask), width=cells)
     template_px = camera.cell_to_px(cell_xy.double(), size=stages.crop.size, cells=cells)
     px = template_px.cpu().numpy()
-    points_obj = lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
-    true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
-    true_px = torch.from_numpy(camera.apply(query.A_crop_img, true_px_img)).to(template_px.device)
-    return stages.correspond.by_truth(template_px, true_px, query.mask)
+    return template_px, lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
+
+
+def _refined(stages: Stages, query: Query, bank: TemplateBank, best: Hypothesis, clock: Clock) -> Hypothesis:
+    """The hypothesis with its pose refined; its inliers stay the solver's, its reprojection is that of the new pose.
+
+    Inliers say how many correspondences agree on a pose, which is what scores go by; a refinement by other means than
+    correspondences has no say in that.
+    """
+    if best.solution is None or best.pair is None or best.points_obj is None or best.query_px_img is None:
+        return best
+    with clock("refine"):
+        _, points_obj = _template_cells(stages, bank.view(best.template_id), best.pair)
+        K_crop = query.A_crop_img @ query.K
+        T_cam_obj = stages.refine(best.solution.T_cam_obj, best.pair, points_obj, K_crop, crop_size=stages.crop.size)
+    if np.array_equal(T_cam_obj, best.solution.T_cam_obj):
+        return best
+    rows = best.solution.inliers
+    error = reprojection_error_px(best.points_obj[rows], best.query_px_img[rows], query.K, T_cam_obj)
+    root_mean_square = float(np.sqrt(np.mean(error**2)))
+    return replace(best, solution=PoseSolution(T_cam_obj, rows, root_mean_square))
 
 
 def _lifted(

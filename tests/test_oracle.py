@@ -22,6 +22,7 @@ from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.pca import Pca
 from pipeline.stages.match.cosine import Cosine
+from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
@@ -37,6 +38,7 @@ FULL = Stages(
     cluster=KMeans(),
     correspond=Corresponder(),
     solve=Epnp(),
+    refine=NoRefinement(),
     detect=GtMask(),
 )
 ABLATIONS = {

@@ -56,6 +56,11 @@ def mask_bbox(mask: Bool[np.ndarray, "H W"]) -> tuple[float, float, float, float
     return float(xs[0]) - 0.5, float(ys[0]) - 0.5, float(xs[-1]) + 0.5, float(ys[-1]) + 0.5
 
 
+def cell_affine(*, size: int, cells: int) -> Float[np.ndarray, "3 3"]:
+    """A_cell_crop: crop pixels to positions (column, row) on a map of ``cells`` cells a side; undoes cell_to_px."""
+    return resize_affine(cells / size)
+
+
 def cell_to_px(cell_xy: Float[Tensor, "m 2"], *, size: int, cells: int) -> Float[Tensor, "m 2"]:
     """Crop pixels (x, y) of positions (column, row) on a map of ``cells`` cells a side; fractions are kept."""
     stride = size / cells

@@ -18,7 +18,7 @@ from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
 POSES_VERSION = 1
-ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve")
+ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "refine")
 
 
 @dataclass(eq=False)
