@@ -96,7 +96,7 @@ def magnified_query(factor: int) -> tuple[Query, TemplateView]:
         K_view = camera.resize_affine(float(times)) @ K
         picture, depth = (np.repeat(np.repeat(image[0], times, 0), times, 1) for image in (rgb, depth_mm))
         whole = (-0.5, -0.5, depth.shape[1] - 0.5, depth.shape[0] - 0.5)
-        crop, mask, A_crop_img = FULL.crop(picture, depth > 0, whole)
+        crop, mask, A_crop_img = FULL.crop(picture, depth > 0, whole, K_view)
         crops = Crops(crop[None], mask[None], A_crop_img[None], Geometry([depth], K_view[None], T_cam_obj[:1]))
         maps = {layer: m[0] for layer, m in backbone(crops, FULL.layers).items()}
         views.append((maps, torch.from_numpy(mask), A_crop_img, K_view))

@@ -97,7 +97,8 @@ class TemplateNodes:
             views = self.read_views(obj_id, rows)
             h, w = views.mask.shape[1:]
             whole = (-0.5, -0.5, w - 0.5, h - 0.5)
-            crops = [self.run.stages.crop(rgb, mask, whole) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
+            crop = self.run.stages.crop
+            crops = [crop(rgb, mask, whole, views.K) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
             return {ref.key: stacked(crops)}
 
         self.run.fill(
