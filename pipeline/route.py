@@ -21,6 +21,7 @@ from torch import Tensor
 from pipeline.errors import NoPose
 from pipeline.functional import camera, rigid
 from pipeline.functional.masks import foreground
+from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
@@ -207,10 +208,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
             seen = np.isfinite(points_obj).all(1)
             if seen.sum() < MIN_POINTS:
                 raise NoPose("lift", f"{seen.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
-            solution = stages.solve(points_obj[seen], query_px_img[seen], query.K)
-            inliers = np.zeros(len(seen), bool)
-            inliers[seen] = solution.inliers
-            parts["solution"] = PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
+            parts["solution"] = _solved(stages, query, points_obj, query_px_img, seen)
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
@@ -242,21 +240,43 @@ def _lifted(
     return points_obj, camera.apply(np.linalg.inv(query.A_crop_img), query_px)
 
 
+def _solved(
+    stages: Stages,
+    query: Query,
+    points_obj: Float[np.ndarray, "m 3"],
+    query_px_img: Float[np.ndarray, "m 2"],
+    seen: Bool[np.ndarray, " m"],
+) -> PoseSolution:
+    """The pose of the points seen, solved in the plane that the solver asks for; errors are in the query image."""
+    points, px_img, inliers = points_obj[seen], query_px_img[seen], np.zeros(len(seen), bool)
+    if stages.solve.plane == "image":
+        solution = stages.solve(points, px_img, query.K)
+        inliers[seen] = solution.inliers
+        return PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
+    K_crop, R_crop_cam = camera.crop_camera(query.A_crop_img, query.K)
+    solution = stages.solve(points, camera.apply(query.A_crop_img, px_img), K_crop)
+    inliers[seen] = solution.inliers
+    T_cam_obj = rigid.rigid(R_crop_cam.T, np.zeros(3)) @ solution.T_cam_obj
+    error_px = reprojection_error_px(points_obj[inliers], query_px_img[inliers], query.K, T_cam_obj)
+    return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px**2))))
+
+
 def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:
     """T_cam_obj from a template alone: its rotation, and the translation that fits place and size of the crop.
 
-    The object's origin keeps its place in the crop; depth scales with focal length times crop magnification; the
-    rotation is turned with the viewing ray, so that the object looks the same from its new place in the image.
+    In the cameras whose pictures the two crops are (camera.crop_camera): the object's origin keeps its place in the
+    crop; depth scales with the focal length; the rotation is turned with the viewing ray, so that the object looks the
+    same from its new place.
     """
-    t = template.T_cam_obj[:3, 3]
-    origin_crop = camera.apply(template.A_crop_img, camera.project(template.K, t))
-    origin_img = camera.apply(np.linalg.inv(query.A_crop_img), origin_crop)
-    zoom_template = template.A_crop_img[0, 0] * template.K[0, 0]
-    zoom_query = query.A_crop_img[0, 0] * query.K[0, 0]
-    depth = t[2] * zoom_query / zoom_template
-    position = camera.unproject(query.K, origin_img[None], np.array([depth]))[0]
+    K_query, R_query_cam = camera.crop_camera(query.A_crop_img, query.K)
+    K_template, R_template_cam = camera.crop_camera(template.A_crop_img, template.K)
+    T_template_obj = rigid.rigid(R_template_cam, np.zeros(3)) @ template.T_cam_obj
+    t = T_template_obj[:3, 3]
+    origin_crop = camera.project(K_template, t)
+    depth = t[2] * K_query[0, 0] / K_template[0, 0]
+    position = camera.unproject(K_query, origin_crop[None], np.array([depth]))[0]
     turn = rigid.rotation_between(t, position)
-    return rigid.rigid(turn @ template.T_cam_obj[:3, :3], position)
+    return rigid.rigid(R_query_cam.T, np.zeros(3)) @ rigid.rigid(turn @ T_template_obj[:3, :3], position)
 
 
 def to_device(features: Mapping[int, np.ndarray], device: str) -> dict[int, Tensor]:
