@@ -1,6 +1,6 @@
 """The method on one page: a detection's features and its object's templates -> a pose, or the reason why there is none.
 
-mesh -render-> templates -crop, extract-> template features            (offline, once for every object)
+mesh -render-> templates -crop, extract-> template features -fit->     (offline, once for every object)
 image -detect, crop, extract-> query features                          (once for every image)
 query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> pose
 """
@@ -30,9 +30,10 @@ from pipeline.stages.correspond import Corresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import Detector
 from pipeline.stages.extract import Extractor
-from pipeline.stages.fuse import Fuser
+from pipeline.stages.fit import Fit, Fitted, chain
+from pipeline.stages.fuse import FittedFuser, Fuser
 from pipeline.stages.lift import lift
-from pipeline.stages.match import Matcher, TruthMatcher
+from pipeline.stages.match import FittedMatcher, Matcher, TruthMatcher
 from pipeline.stages.render import Renderer
 from pipeline.stages.solve import Solver
 
@@ -65,6 +66,12 @@ class Stages:
     def layers(self) -> tuple[int, ...]:
         """Decoder layers the route reads: the template layer and the hyperfeature layers."""
         return tuple(sorted({self.match.layer, *self.fuse.layers}))
+
+    @property
+    def fits(self) -> tuple[Fit, ...]:
+        """What is fitted to an object's templates, each once, and before it what it stands on."""
+        found = [s.fit for s in (self.match, self.fuse) if isinstance(s, (FittedMatcher, FittedFuser))]
+        return tuple(dict.fromkeys(part for fit in found for part in chain(fit)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +108,15 @@ class TemplateView:
 class TemplateBank(Protocol):
     """An object's templates: features of the match layer, crop masks and poses of all of them, any view in full."""
 
-    features: Float[Tensor, "n c h w"]
-    mask: Bool[Tensor, "n S S"]
+    @property
+    def features(self) -> Float[Tensor, "n c h w"]:
+        """Features of the match layer."""
+        ...
+
+    @property
+    def mask(self) -> Bool[Tensor, "n S S"]:
+        """Masks of the crops."""
+        ...
 
     @property
     def T_cam_obj(self) -> Float[np.ndarray, "n 4 4"]:
@@ -111,6 +125,10 @@ class TemplateBank(Protocol):
 
     def view(self, index: int) -> TemplateView:
         """Everything about one template."""
+        ...
+
+    def fitted(self, fit: Fit) -> Fitted:
+        """What was fitted to the templates."""
         ...
 
 
@@ -184,7 +202,10 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
 def _match(stages: Stages, query: Query, bank: TemplateBank) -> TemplateMatch:
     if isinstance(stages.match, TruthMatcher) and query.truth is not None:
         return stages.match.by_truth(query.truth.T_cam_obj, query.truth.symmetries, bank.T_cam_obj)
-    return stages.match(query.features[stages.match.layer], query.mask, bank.features, bank.mask)
+    features = query.features[stages.match.layer]
+    if isinstance(stages.match, FittedMatcher):
+        return stages.match.by_fitted(features, query.mask, bank.fitted(stages.match.fit))
+    return stages.match(features, query.mask, bank.features, bank.mask)
 
 
 def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, score: float, clock: Clock) -> Hypothesis:
@@ -193,7 +214,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
         with clock("read template"):
             template = bank.view(index)
         with clock("fuse"):
-            pair = stages.fuse(query.features, template.features, query.mask, template.mask)
+            pair = _fused(stages, query, template, bank)
             parts["pair"] = pair
         with clock("cluster"):
             clusters = stages.cluster(pair)
@@ -212,6 +233,13 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
+
+
+def _fused(stages: Stages, query: Query, template: TemplateView, bank: TemplateBank) -> FusedPair:
+    sides = query.features, template.features, query.mask, template.mask
+    if isinstance(stages.fuse, FittedFuser):
+        return stages.fuse.by_fitted(*sides, bank.fitted(stages.fuse.fit))
+    return stages.fuse(*sides)
 
 
 def _matched(
