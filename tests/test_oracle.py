@@ -16,13 +16,16 @@ from pipeline.spec import Runtime
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
+from pipeline.stages.correspond.cyclic import Cyclic
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
 from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.pca import Pca
+from pipeline.stages.fuse.template_pca import TemplatePca
 from pipeline.stages.match.cosine import Cosine
+from pipeline.stages.match.words import Words
 from pipeline.stages.render.raycast import Raycast
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
@@ -45,7 +48,14 @@ ABLATIONS = {
     "clusters off": {"cluster": One()},
     "sub-pixel off": {"correspond": Corresponder(kernel=1)},
     "co-projection off": {"fuse": Concat()},
-    "virtual camera, solved in the crop": {"crop": Virtual(), "solve": Epnp(plane="crop")},
+    "FoundPose's stages": {
+        "crop": Virtual(padding_ratio=1.7),
+        "match": Words(count=256),
+        "fuse": TemplatePca(dim=64),
+        "cluster": One(),
+        "correspond": Cyclic(),
+        "solve": Epnp(plane="crop", threshold_px=10.0),
+    },
 }
 
 
