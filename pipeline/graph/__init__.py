@@ -5,6 +5,7 @@ anything is computed: a plan costs nothing, a step runs only what is missing, an
 touches no template and no backbone.
 
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
+template features -> what is fitted to them, where a stage stands on it             templates.py
 image, detections -> query crops -> query features (by timestep and layer)          queries.py
 template features, query features, stages -> poses (by scene and object) -> run     poses.py
 poses, ground truth -> scores                                                       scores.py

@@ -55,9 +55,13 @@ class Plan:
                 "template crops", of, self.templates.crops(obj_id), _size(self.run.crops_layout(), n), f"{n} crops"
             ),
         ]
-        return nodes + [
+        nodes += [
             self._features("template features", f"{of} layer {layer}", self.templates.features(obj_id, layer), layer, n)
             for layer in self.run.stages.layers
+        ]
+        return nodes + [
+            self._node("fits", f"{of} {fit.kind}", self.templates.fitted(obj_id, fit), 0, f"{n} templates")
+            for fit in self.run.stages.fits
         ]
 
     def _of_image(self, image: ImageId) -> list[Node]:

@@ -42,3 +42,12 @@ class Clusters:
     template_label: Int[Tensor, "h w"]
     pairs: Int[Tensor, "p 2"]
     note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateCells:
+    """Features of one layer in all foreground cells of an object's n templates. ``template``: which one each is of."""
+
+    features: Float[Tensor, "m c"]
+    template: Int[Tensor, " m"]
+    templates: int
