@@ -140,7 +140,7 @@ def _lands(field: Field, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]
     """Which positions lie in a foreground cell, between centres of cells."""
     h, w = field.mask.shape
     with np.errstate(invalid="ignore"):
-        inside = ((xy >= 0) & (xy <= (w - 1, h - 1))).all(1)
+        inside = np.asarray(((xy >= 0) & (xy <= (w - 1, h - 1))).all(1))
     column, row = np.where(inside[:, None], np.floor(xy + 0.5), 0).astype(np.int64).T
     return inside & field.mask[row, column]
 
