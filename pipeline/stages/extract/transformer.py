@@ -116,7 +116,7 @@ def saliency(
 ) -> Float[Tensor, "n t 1"]:
     """The class token's attention to every patch, mean of ``heads``, from 0 (least) to 1 (most) in each image.
 
-    Amir et al., ECCVW 2022, Sec. 4, with the heads of their code. An image that is the same everywhere gives 0.
+    Amir et al., ECCVW 2022, and their code. An image that is the same everywhere gives 0.
     """
     count = model.config.num_attention_heads
     query = projected(block, tokens[:, :1], "query").unflatten(-1, (count, -1))
