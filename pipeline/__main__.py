@@ -164,8 +164,11 @@ def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:
 
 
 def variant(values: Mapping[str, Any], where: str) -> Any:
-    """The spec that ``_target_`` names, with its fields checked; ``auto`` variants answer with a concrete one."""
-    fields = dict(values)
+    """The spec that ``_target_`` names, with its fields checked; ``auto`` variants answer with a concrete one.
+
+    A field whose value has a ``_target_`` of its own is built first, to any depth: a variant made of variants.
+    """
+    fields = {name: _nested(value, f"{where}.{name}") for name, value in values.items()}
     target = fields.pop("_target_", None)
     if not isinstance(target, str):
         raise BadInput(f"{where}._target_", found=repr(target), needed="the import path of a class")
@@ -177,6 +180,10 @@ def variant(values: Mapping[str, Any], where: str) -> Any:
         ) from None
     chosen: Any = build(cls, fields, where=where)
     return chosen.resolve() if hasattr(chosen, "resolve") else chosen
+
+
+def _nested(value: Any, where: str) -> Any:
+    return variant(value, where) if isinstance(value, Mapping) and "_target_" in value else value
 
 
 def _told(error: BaseException) -> str:

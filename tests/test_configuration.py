@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from pipeline.spec import _tuples
+from pipeline.spec import _tuples, build
 
 CONF = Path(__file__).parents[1] / "conf"
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "refine", "detect")
@@ -15,7 +15,14 @@ VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.ya
 
 
 def loaded(path: Path) -> tuple[type, dict]:
+    """The class of a yaml and its fields; the variants in its defaults list are built into the fields they are for."""
     values = OmegaConf.to_container(OmegaConf.load(path))
+    for entry in values.pop("defaults", ()):
+        if isinstance(entry, dict):
+            ((place, name),) = entry.items()
+            group, field = place.lstrip("/").split("@")
+            cls, inner = loaded(CONF / group / f"{name}.yaml")
+            values[field] = build(cls, inner, where=field)
     module, name = values.pop("_target_").rsplit(".", 1)
     return getattr(importlib.import_module(module), name), values
 
