@@ -61,7 +61,7 @@ train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints;
 	$(PY) -m pipeline.embedded $(ARGS)
 
 benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights; ARGS="--lmo ... --detections ..."
-	$(PY) -m pipeline.embedded --benchmark $(ARGS)
+	$(PY) -m pipeline.benchmark $(ARGS)
 
 report: $(STAMP) ## one page of all runs below results/: results/report/index.html
 	$(PY) -m pipeline step=report $(ARGS)

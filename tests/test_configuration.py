@@ -16,7 +16,8 @@ VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.ya
 
 def loaded(path: Path) -> tuple[type, dict]:
     """The class of a yaml and its fields; the variants in its defaults list are built into the fields they are for."""
-    values = OmegaConf.to_container(OmegaConf.load(path))
+    around = {"weights": OmegaConf.load(CONF / "config.yaml").weights, "variant": OmegaConf.load(path)}
+    values = OmegaConf.to_container(OmegaConf.create(around), resolve=True)["variant"]
     for entry in values.pop("defaults", ()):
         if isinstance(entry, dict):
             ((place, name),) = entry.items()

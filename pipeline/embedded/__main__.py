@@ -1,7 +1,4 @@
-"""``python -m pipeline.embedded``: the embedded model, from nothing to weights, as far as the time allows.
-
-``--benchmark`` measures what ships beside its controls instead.
-"""
+"""``python -m pipeline.embedded``: the embedded model, from nothing to weights, as far as the time allows."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ from pathlib import Path
 
 import torch
 
-from pipeline.embedded.benchmark import benchmark
 from pipeline.embedded.export import export
 from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
 from pipeline.embedded.views import make_shard
@@ -26,14 +22,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=120.0, help="stop after so long; the next call goes on")
     parser.add_argument("--scale", type=float, default=1.0, help="of the number of steps: more on a faster machine")
     parser.add_argument("--threads", type=int, default=0, help="0 = all cores")
-    parser.add_argument("--benchmark", action="store_true", help="measure instead of training; cache in --folder")
-    parser.add_argument("--lmo", type=Path, help="benchmark: folder of LM-O, for the same table on photographs")
-    parser.add_argument("--detections", type=Path, help="benchmark: a detector's json for LM-O")
-    options = parser.parse_args()
-    if options.benchmark:
-        print(benchmark(options.folder.resolve(), lmo=options.lmo, detections=options.detections))
-    else:
-        run(options)
+    run(parser.parse_args())
 
 
 def run(options: argparse.Namespace) -> None:

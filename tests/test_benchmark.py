@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.embedded import benchmark
+from pipeline import benchmark
 from pipeline.items.scores import Scores
 from pipeline.report.rows import Row
 

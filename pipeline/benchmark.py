@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -86,3 +87,17 @@ def _bracketed(values: np.ndarray, row: Row) -> str:
 
 def _shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}"
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(prog="python -m pipeline.benchmark", description=__doc__)
+    parser.add_argument("--folder", type=Path, default=Path("cache/benchmark"), help="data, cache and results")
+    parser.add_argument("--lmo", type=Path, help="folder of LM-O, for the same table on photographs")
+    parser.add_argument("--detections", type=Path, help="a detector's json for LM-O, for the table once more")
+    options = parser.parse_args()
+    print(benchmark(options.folder.resolve(), lmo=options.lmo, detections=options.detections))
+
+
+if __name__ == "__main__":
+    main()
