@@ -37,33 +37,27 @@ def warp(
     Enlarged: bilinear, as ``resample``. Shrunk: the mean of n x n bilinear samples spread over the crop's pixel, n the
     least with no sample more than an image pixel from the next; a touch softer than ``resample``'s mean over the area.
     """
-    grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(float)
+    grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2).astype(float)
     A_img_crop = np.linalg.inv(A_crop_img)
     corners = np.array([[-0.5, -0.5], [size - 0.5, -0.5], [-0.5, size - 0.5], [size - 0.5, size - 0.5]])
     n = int(np.clip(np.ceil(local_zoom(A_img_crop, corners).max() - 1e-6), 1, _FINEST))
     offsets = (np.arange(n) + 0.5) / n - 0.5
-    total = np.zeros((size, size, *image.shape[2:]), np.float32)
-    for dy in offsets:
-        for dx in offsets:
-            total += _bilinear(image, apply(A_img_crop, grid + np.array([dx, dy])))
-    return total / np.float32(n * n)
+    pixels = np.pad(image.reshape(*image.shape[:2], -1).astype(np.float32), ((2, 2), (2, 2), (0, 0)))
+    samples = (_bilinear(pixels, apply(A_img_crop, grid + np.array([x, y]))) for y in offsets for x in offsets)
+    total = sum(samples, np.zeros((size * size, pixels.shape[2]), np.float32))
+    return (total / np.float32(n * n)).reshape(size, size, *image.shape[2:])
 
 
-def _bilinear(image: Shaped[np.ndarray, "H W *c"], px: Float[np.ndarray, "S S 2"]) -> Float[np.ndarray, "S S *c"]:
-    """Values between the four nearest pixels; those outside the image count as 0."""
-    height, width = image.shape[:2]
-    corner = np.floor(px)
-    fraction = (px - corner).astype(np.float32)
-    x0, y0 = np.moveaxis(corner.clip(-2, max(height, width) + 1).astype(np.int64), -1, 0)  # far away stays outside
-    found = np.zeros((*px.shape[:2], *image.shape[2:]), np.float32)
-    for i in (0, 1):
-        for j in (0, 1):
-            x, y = x0 + j, y0 + i
-            weight = np.abs(1 - j - fraction[..., 0]) * np.abs(1 - i - fraction[..., 1])
-            weight = weight * ((x >= 0) & (x < width) & (y >= 0) & (y < height))
-            values = image[y.clip(0, height - 1), x.clip(0, width - 1)]
-            found += values * weight.reshape(weight.shape + (1,) * (image.ndim - 2))
-    return found
+def _bilinear(pixels: Float[np.ndarray, "rows columns c"], px: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m c"]:
+    """Values between the four nearest pixels of an image that has two more rows and columns of zeros on each side."""
+    low = np.floor(px)
+    x, y = (px - low).astype(np.float32).T[..., None]
+    rows, columns, _ = pixels.shape
+    column, row = low.clip(-2, [columns - 4, rows - 4]).astype(np.int64).T + 2  # far away is where two zeros meet
+    flat = pixels.reshape(rows * columns, -1)
+    a, b, c, d = (flat.take(row * columns + column + step, axis=0) for step in (0, 1, columns, columns + 1))
+    upper, lower = a + x * (b - a), c + x * (d - c)
+    return upper + y * (lower - upper)
 
 
 def _weights(pixels: int, *, size: int, scale: float, shift: float) -> Float[np.ndarray, "size pixels"]:

@@ -53,5 +53,5 @@ class Virtual(Spec):
         except ValueError as reason:
             raise NoPose("crop", f"box {text_of(box)} with this K: {reason}") from None
         shown = rgb * area[..., None] if self.background == "remove" else rgb
-        crop = np.rint(warp(shown, A_crop_img, size=self.size)).clip(0, 255).astype(np.uint8)
-        return crop, warp(area, A_crop_img, size=self.size) >= HALF, A_crop_img
+        both = warp(np.dstack([shown, area]), A_crop_img, size=self.size)
+        return np.rint(both[..., :3]).clip(0, 255).astype(np.uint8), both[..., 3] >= HALF, A_crop_img
