@@ -1,42 +1,67 @@
 """A pose from feature maps without matching: object points whose descriptors the query ought to show where they land.
 
-A query's map is read in between cells, at positions (x, y) in cells. Points that land outside the map, outside its
-mask or behind the camera read nothing. An increment xi = (v, omega) turns about the points' centre c in the camera
+A query's map is read in between cells, bilinear, at positions (x, y) in cells. Points that land outside the map,
+outside its mask or behind the camera read nothing. Residuals need inner products alone, and those of a map with itself
+are the same in every step, so that a step costs one product of each point's descriptor with the four cells around it. An increment xi = (v, omega) turns about the points' centre c in the camera
 frame: p -> c + exp(omega) (p - c) + v, a left multiplication of T_cam_obj that does not mix turning with shifting.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.functional.rigid import nearest_rotation, rigid, transform
 
 _FILL_CELLS = 0.7  # blur that carries the foreground's descriptors over its edge
 _DAMPING = (1e-7, 1e-3, 1e6)  # least, first, and where no step is left
-_FALL = 1e-6  # relative fall of the cost that is not worth another step
+_FALL = 1e-4  # relative fall of the cost that is not worth another step
 _FLOOR = 0.05  # least scale, in lengths of a descriptor: residuals of an exact fit are rounding
+_CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row, column
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A query's descriptors at cell centres and, behind its mask's edge, what the nearest foreground shows."""
+    """A query's descriptors by squares of four neighbouring cells' centres, in reading order of the upper left one.
 
-    values: Float32[np.ndarray, "h w c"]
+    ``gram``: inner products of the four. ``directions``: a descriptor read counts as if it were of unit length.
+    """
+
+    corners: Float32[np.ndarray, "n 4 c"]
+    gram: Float32[np.ndarray, "n 4 4"]
     mask: Bool[np.ndarray, "h w"]
+    directions: bool
+
+    @classmethod
+    def of(
+        cls, values: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, directions: bool = False
+    ) -> Field:
+        """The field of a map."""
+        h, w, c = values.shape
+        four = [values[i : h - 1 + i, j : w - 1 + j] for i, j in _CORNERS]
+        corners = np.stack(four, axis=2).reshape(-1, 4, c)
+        return cls(corners, np.matmul(corners, corners.swapaxes(1, 2)), mask, directions)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Object points (mm), the descriptor of each, and the squared residual it has to a mean cell of the query."""
+    """Object points (mm), the descriptor of each, and its mean squared residual to the query's foreground cells."""
 
     points_obj: Float[np.ndarray, "m 3"]
     descriptors: Float32[np.ndarray, "m c"]
-    unseen: Float32[np.ndarray, " m"]
+    unseen: Float[np.ndarray, " m"]
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Of points that read a field: squared residuals, half their gradient by (x, y) and Gauss-Newton's half Hessian."""
+
+    squared: Float[np.ndarray, " m"]
+    pull: Float[np.ndarray, "m 2"]
+    curve: Float[np.ndarray, "m 2 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,19 +108,37 @@ def _gaussian(n: int, sigma: float) -> Float32[np.ndarray, "n n"]:
     return np.exp(-0.5 * (apart / sigma) ** 2).astype(np.float32)
 
 
-def read(
-    field: Field, xy: Float[np.ndarray, "m 2"]
-) -> tuple[Float32[np.ndarray, "m c"], Float32[np.ndarray, "m c"], Float32[np.ndarray, "m c"]]:
-    """Descriptors at positions inside the map, bilinear, and their derivatives by x and by y, per cell."""
-    h, w, _ = field.values.shape
+def read(field: Field, xy: Float[np.ndarray, "m 2"], descriptors: Float32[np.ndarray, "m c"]) -> Residuals:
+    """What is read at positions inside the map, minus the descriptors that ought to be there. Per cell."""
+    h, w = field.mask.shape
     corner = np.clip(np.floor(xy).astype(np.int64), 0, (w - 2, h - 2))
-    a, b = np.split((xy - corner).astype(np.float32), 2, axis=1)
-    flat, index = field.values.reshape(h * w, -1), corner[:, 1] * w + corner[:, 0]
-    here, right, below, across = (flat[index + step] for step in (0, 1, w, w + 1))
-    top, bottom = right - here, across - below
-    upper, lower = here + a * top, below + a * bottom
-    dy = lower - upper
-    return upper + b * dy, top + b * (bottom - top), dy
+    a, b = (xy - corner).T
+    square = corner[:, 1] * (w - 1) + corner[:, 0]
+    value = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
+    by_x, by_y = [b - 1, 1 - b, -b, b], [a - 1, -a, 1 - a, a]
+    weights = np.stack([np.stack(rows, axis=1) for rows in (value, by_x, by_y)], axis=1)
+    own = np.matmul(np.matmul(weights, field.gram[square]), weights.swapaxes(1, 2))
+    with_descriptor = np.matmul(field.corners[square], descriptors[:, :, None]).astype(np.float64)
+    cross = np.matmul(weights, with_descriptor)[:, :, 0]
+    power = np.square(descriptors, dtype=np.float64).sum(1)
+    if field.directions:
+        own, cross = _of_directions(own, cross)
+    squared = np.maximum(own[:, 0, 0] + power - 2 * cross[:, 0], 0)
+    return Residuals(squared, own[:, 0, 1:] - cross[:, 1:], own[:, 1:, 1:])
+
+
+def _of_directions(
+    own: Float[np.ndarray, "m 3 3"], cross: Float[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]]:
+    """Inner products of f / |f| and its derivatives, from those of f and its own: the part along f drops out."""
+    power = np.maximum(own[:, 0, 0], np.finfo(np.float32).tiny)
+    length, along = np.sqrt(power), own[:, 0, 1:] / power[:, None]
+    turned = np.zeros_like(own)
+    turned[:, 0, 0] = 1
+    turned[:, 1:, 1:] = own[:, 1:, 1:] / power[:, None, None] - along[:, :, None] * along[:, None]
+    seen = cross / length[:, None]
+    seen[:, 1:] -= seen[:, :1] * along
+    return turned, seen
 
 
 def project_cells(
@@ -123,20 +166,18 @@ def moved(
     return rigid(R, turn @ (T_cam_obj[:3, 3] - centre_cam) + centre_cam + xi[:3])
 
 
-def residuals(
+def squared_residuals(
     surface: Surface, field: Field, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
     """Squared residual of every point, and which points read the query: the others have their ``unseen``."""
-    points_cam = transform(T_cam_obj, surface.points_obj)
-    xy, _ = project_cells(K_cell, points_cam, points_cam.mean(0))
-    seen = _lands(field, xy)
-    squared = surface.unseen.astype(np.float64)
-    apart = read(field, xy[seen])[0] - surface.descriptors[seen]
-    squared[seen] = np.einsum("mc,mc->m", apart, apart)
+    xy, _ = project_cells(K_cell, transform(T_cam_obj, surface.points_obj), np.zeros(3))
+    seen = lands(field, xy)
+    squared = surface.unseen.copy()
+    squared[seen] = read(field, xy[seen], surface.descriptors[seen]).squared
     return squared, seen
 
 
-def _lands(field: Field, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
+def lands(field: Field, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
     """Which positions lie in a foreground cell, between centres of cells."""
     h, w = field.mask.shape
     with np.errstate(invalid="ignore"):
@@ -160,20 +201,16 @@ def normal_equations(
     points_cam = transform(T_cam_obj, surface.points_obj)
     centre = points_cam.mean(0)
     xy, by_xi = project_cells(K_cell, points_cam, centre)
-    seen = _lands(field, xy)
-    values, dx, dy = read(field, xy[seen])
-    apart = values - surface.descriptors[seen]
-    squared = surface.unseen.astype(np.float64)
-    squared[seen] = np.einsum("mc,mc->m", apart, apart)
-    weight = robust.weight(squared[seen]) / len(squared)
-    xx, x_y, yy, xr, yr = (
-        np.einsum("mc,mc->m", a, b) for a, b in ((dx, dx), (dx, dy), (dy, dy), (dx, apart), (dy, apart))
-    )
-    gram = np.stack([xx, x_y, x_y, yy], 1).reshape(-1, 2, 2) * weight[:, None, None]
-    pull = np.stack([xr, yr], 1) * weight[:, None]
-    J = by_xi[seen].reshape(-1, 6)
-    weighted = np.matmul(gram, by_xi[seen]).reshape(-1, 6)
-    return float(robust.cost(squared).mean()), J.T @ weighted, J.T @ pull.reshape(-1), centre
+    seen = lands(field, xy)
+    found = read(field, xy[seen], surface.descriptors[seen])
+    squared = surface.unseen.copy()
+    squared[seen] = found.squared
+    weight = robust.weight(found.squared) / len(squared)
+    by_xi = by_xi[seen]
+    pull = (found.pull * weight[:, None]).reshape(-1)
+    curve = np.matmul(found.curve * weight[:, None, None], by_xi).reshape(-1, 6)
+    J = by_xi.reshape(-1, 6)
+    return float(robust.cost(squared).mean()), J.T @ curve, J.T @ pull, centre
 
 
 def descend(
@@ -188,7 +225,7 @@ def descend(
     """The pose after at most that many steps of Levenberg-Marquardt; each step taken lowers the mean robust cost.
 
     Marquardt's damping: the matrix's own diagonal, ten times more of it after a step that did not help, ten times less
-    after one that did.
+    after one that did. Ends where the next step promises no fall that is worth it.
     """
     least, damping, most = _DAMPING
     cost, H, g, centre = normal_equations(surface, field, K_cell, T_cam_obj, robust)
@@ -197,15 +234,14 @@ def descend(
         if damping > most or not diagonal.min() > 0:
             break
         step = np.linalg.solve(H + damping * np.diag(diagonal), -g)
+        if -(g + H @ step / 2) @ step < _FALL * cost:
+            break
         T_next = moved(T_cam_obj, centre, step)
         after = normal_equations(surface, field, K_cell, T_next, robust)
-        if not after[0] < cost:
+        if after[0] < cost:
+            T_cam_obj, (cost, H, g, centre), damping = T_next, after, max(damping / 10, least)
+        else:
             damping *= 10
-            continue
-        fall = 1 - after[0] / cost
-        T_cam_obj, (cost, H, g, centre), damping = T_next, after, max(damping / 10, least)
-        if fall < _FALL:
-            break
     return T_cam_obj
 
 
@@ -213,7 +249,7 @@ def robust_scale(
     surface: Surface, field: Field, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
 ) -> float:
     """Median length of the residuals of the points that read the query; never below rounding of an exact fit."""
-    squared, seen = residuals(surface, field, K_cell, T_cam_obj)
+    squared, seen = squared_residuals(surface, field, K_cell, T_cam_obj)
     length = float(np.sqrt(np.mean(np.square(surface.descriptors).sum(1))))
     median = float(np.sqrt(np.median(squared[seen]))) if seen.any() else length
     return max(median, _FLOOR * length, float(np.finfo(np.float32).tiny))
@@ -230,15 +266,18 @@ def level(
     query_mask: Bool[np.ndarray, "h w"],
     template: Float32[np.ndarray, "h w c"],
     template_mask: Bool[np.ndarray, "h w"],
-    cell: Sequence[int] | np.ndarray,
+    cell: Int[np.ndarray, " m"],
     points_obj: Float[np.ndarray, "m 3"],
     *,
     sigma_cells: float,
+    directions: bool,
 ) -> tuple[Surface, Field]:
     """Template cells (flat indices) with their points, and the query, both smoothed alike."""
-    field = Field(smoothed(query, query_mask, sigma_cells=sigma_cells), query_mask)
+    shown = smoothed(query, query_mask, sigma_cells=sigma_cells)
     d = smoothed(template, template_mask, sigma_cells=sigma_cells).reshape(-1, template.shape[-1])[cell]
-    shown = field.values[query_mask]
-    mean, power = shown.mean(0), float(np.square(shown).sum(1).mean())
-    unseen = np.maximum(np.square(d).sum(1) + power - 2 * d @ mean, 0)
-    return Surface(points_obj, d, unseen), field
+    if directions:
+        shown, d = unit(shown), unit(d)
+    inside = shown[query_mask]
+    unseen = np.square(d).sum(1) + np.square(inside).sum(1).mean() - 2 * d @ inside.mean(0)
+    surface = Surface(points_obj, d, np.maximum(unseen, 0).astype(np.float64))
+    return surface, Field.of(shown, query_mask, directions=directions)

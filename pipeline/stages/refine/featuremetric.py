@@ -66,7 +66,16 @@ class Featuremetric(Spec):
         K_cell = cell_affine(size=crop_size, cells=query_mask.shape[-1]) @ K_crop
         T = T_cam_obj
         for sigma in self.sigmas_cells:
-            surface, field = level(query, query_mask, template, template_mask, cell, points, sigma_cells=sigma)
+            surface, field = level(
+                query,
+                query_mask,
+                template,
+                template_mask,
+                cell,
+                points,
+                sigma_cells=sigma,
+                directions=self.normalise,
+            )
             robust = Robust(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T))
             T = descend(surface, field, K_cell, T, robust, iterations=self.iterations)
         robust = Robust(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T_cam_obj))
