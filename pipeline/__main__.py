@@ -162,8 +162,14 @@ def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:
 
 
 def variant(values: Mapping[str, Any], where: str) -> Any:
-    """The spec that ``_target_`` names, with its fields checked; ``auto`` variants answer with a concrete one."""
-    fields = dict(values)
+    """The spec that ``_target_`` names, with its fields checked, some of which may be variants themselves.
+
+    ``auto`` variants answer with a concrete one.
+    """
+    fields = {
+        name: variant(value, f"{where}.{name}") if isinstance(value, Mapping) and "_target_" in value else value
+        for name, value in values.items()
+    }
     target = fields.pop("_target_", None)
     if not isinstance(target, str):
         raise BadInput(f"{where}._target_", found=repr(target), needed="the import path of a class")

@@ -27,7 +27,7 @@ from pipeline.items.poses import PoseSolution
 from pipeline.stages.cluster import Clusterer
 from pipeline.stages.correspond import Corresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
-from pipeline.stages.detect import Detector
+from pipeline.stages.detect import DescribingDetector, Detector
 from pipeline.stages.extract import Extractor
 from pipeline.stages.fuse import Fuser
 from pipeline.stages.lift import lift
@@ -50,7 +50,7 @@ class Stages:
     cluster: Clusterer
     correspond: Corresponder
     solve: Solver
-    detect: Detector
+    detect: Detector | DescribingDetector
     fallback: bool = False
 
     @property

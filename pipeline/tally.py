@@ -12,6 +12,8 @@ STEPS = (
     "templates",
     "template crops",
     "template features",
+    "proposals",
+    "proposal features",
     "detections",
     "query crops",
     "query features",

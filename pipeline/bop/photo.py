@@ -1,4 +1,4 @@
-"""One's own mesh, photograph, camera and mask or box -> a dataset of one target."""
+"""One's own mesh, photograph, camera and perhaps a mask or box -> a dataset of one target."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SMALLEST_MM = 2.0
 
 @spec
 class PhotoConfig(Spec):
-    """A mesh, a photograph, K, and where the object is: a mask, or a box.
+    """A mesh, a photograph, K, and where the object is: a mask, or a box, or neither for a detector that finds it.
 
     ``K``: fx, fy, cx, cy or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height of its pixels.
     ``scale`` multiplies the mesh's vertices, 1000 for a mesh in metres.
@@ -48,10 +48,9 @@ class PhotoConfig(Spec):
         K = self._matrix()
         check_K(K, size_hw, "dataset.K")
         _check_principal_point(K, size_hw)
-        if (self.mask is None) == (self.bbox is None):
-            found = "neither" if self.mask is None else "both"
+        if self.mask is not None and self.bbox is not None:
             raise BadInput(
-                "dataset", found=f"{found} of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
+                "dataset", found="both of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
             )
         if self.bbox is not None and not np.isfinite(self.bbox).all():
             raise BadInput("dataset.bbox", found=list(self.bbox), needed="four finite numbers: x, y, width, height")

@@ -5,6 +5,8 @@ anything is computed: a plan costs nothing, a step runs only what is missing, an
 touches no template and no backbone.
 
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
+image -> proposals -> crops -> features, for a detector that describes them         proposals.py
+files, or features of proposals and templates -> detections                         detections.py
 image, detections -> query crops -> query features (by timestep and layer)          queries.py
 template features, query features, stages -> poses (by scene and object) -> run     poses.py
 poses, ground truth -> scores                                                       scores.py
@@ -14,8 +16,10 @@ from __future__ import annotations
 
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
+from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
+from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
@@ -32,7 +36,8 @@ class Graph:
     def __init__(self, run: Context) -> None:
         self.run = run
         self.templates = TemplateNodes(run)
-        self.queries = QueryNodes(run)
+        self.detections = DetectionNodes(run, proposal_nodes(run))
+        self.queries = QueryNodes(run, self.detections)
         self.poses = PoseNodes(run, self.templates, self.queries)
 
     def check(self) -> None:
@@ -47,15 +52,19 @@ class Graph:
                     if "layer" in fault.where:
                         raise BadInput(where, found=fault.found, needed=fault.needed) from None
                     raise
+        if self.detections.proposals:
+            self.detections.proposals.check()
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
         for obj_id in self.run.object_ids:
             self.templates.onboard(obj_id)
+            if self.detections.proposals and not self.detections.known:
+                self.detections.proposals.make_template_features(obj_id)
 
     def detect(self) -> int:
         """Detections of all targets; returns how many."""
-        return len(self.queries.detections)
+        return len(self.detections.all)
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
@@ -73,4 +82,4 @@ class Graph:
 
     def plan(self) -> list[Node]:
         """Every node with its state, key, size and cost."""
-        return Plan(self.run, self.templates, self.queries, self.poses).nodes()
+        return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()
