@@ -133,7 +133,11 @@ def _detect(graph: Graph, options: Options) -> None:
     """Detections, and their file where they were not read from one."""
     if graph.detections.proposals:
         _check_folder(Path(options.out))
-    print(f"{graph.detect()} detections")
+    found = graph.detect()
+    without = [d for d in found if d.defect is not None]
+    print(f"{len(found) - len(without)} detections")
+    for d in without[:ROWS_SHOWN]:
+        print(f"object {d.obj_id} in scene {d.scene_id}, image {d.im_id}: {d.defect}")
     if graph.detections.proposals:
         print(f"written   {_outputs(graph, None, options).write_detections()}")
 

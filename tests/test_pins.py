@@ -23,6 +23,7 @@ UNPINNED = {
     "extract/stable_diffusion",
     "detect/json",
     "detect/photo",
+    "detect/cnos",
     "render/auto",
     "extract/embedded",
     "fuse/learned",

@@ -25,6 +25,7 @@ from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
+from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
 
 __all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
@@ -62,9 +63,9 @@ class Graph:
             if self.detections.proposals and not self.detections.known:
                 self.detections.proposals.make_template_features(obj_id)
 
-    def detect(self) -> int:
-        """Detections of all targets; returns how many."""
-        return len(self.detections.all)
+    def detect(self) -> list[Detection]:
+        """Detections of all targets, those that cannot be used included."""
+        return self.detections.all
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""

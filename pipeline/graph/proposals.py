@@ -177,5 +177,6 @@ def proposal_nodes(run: Context) -> ProposalNodes | None:
     extract = cast(Extractor, detector.describe)
     if extract == run.stages.extract:
         return ProposalNodes(run, detector)  # one backbone in memory
-    stages = replace(run.stages, extract=extract)
-    return ProposalNodes(Context(stages, run.dataset, run.targets, run.store, run.runtime, run.tally), detector)
+    describing = replace(run, stages=replace(run.stages, extract=extract))
+    describing.model = run.model  # meshes are read once
+    return ProposalNodes(describing, detector)

@@ -1,13 +1,10 @@
 """What is made of descriptors: assignment, thresholds, suppression, reasons."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from pipeline.bop.masks import encode
 from pipeline.errors import BadInput
@@ -124,14 +121,5 @@ def test_bad_field_is_one_line(field: str, value: object):
     assert "\n" not in str(raised.value)
 
 
-def test_yaml_lists_every_field_with_its_default():
-    values = yaml.safe_load((Path(__file__).parents[2] / "conf" / "detect" / "cnos.yaml").read_text())
-    assert values.pop("_target_") == f"{Cnos.__module__}.{Cnos.__name__}"
-    nested = {name.split("@")[-1] for entry in values.pop("defaults") if isinstance(entry, dict) for name in entry}
-    assert nested == {"proposals", "describe"}
-    for field in fields(Cnos):
-        if field.name not in nested:
-            assert (values.pop(field.name), field.name) == (field.default, field.name)
-    assert not values
-    assert fields(Cnos)[0].default is MISSING
+def test_class_token_and_sam_are_the_default():
     assert (cnos().proposals, cnos().describe_layer) == (Sam(), CLASS_TOKEN_LAYER)
