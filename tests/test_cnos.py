@@ -317,6 +317,14 @@ def test_a_photograph_and_a_mesh_are_enough(photo, tmp_path: Path):
     assert "proposals" not in counts
 
 
+def test_several_meshes_are_found_in_one_photograph(photo, painted, tmp_path: Path):
+    both = f"dataset.mesh=[{painted}/models/obj_000001.ply,{painted}/models/obj_000002.ply]"
+    ran = photo("step=estimate", both, "detect.proposals.points_per_side=4")
+    assert ran.status == 0, ran.err
+    answers = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())["answers"]
+    assert {answer["obj_id"] for answer in answers} == {1, 2}
+
+
 def test_the_file_of_detections_leads_to_the_same_pose(photo, tmp_path: Path):
     assert photo("step=estimate").status == 0
     (path,) = tmp_path.glob("results/*/*/detections.json")
@@ -350,6 +358,8 @@ def test_a_plan_of_a_photograph_runs_no_model(photo):
         (("detect.proposals.weights=./nowhere",), "detect.proposals.weights: found './nowhere'"),
         (("detect.describe_layer=-2",), "detect.describe_layer"),
         (("dataset.mask=a.png", "dataset.bbox=[1,2,3,4]"), "both of mask and bbox"),
+        (("dataset.mesh=[a.ply,b.ply]", "dataset.mask=a.png"), "dataset.mesh: found 2 meshes and where one object is"),
+        (("dataset.mesh=[]",), "dataset.mesh: found 0 meshes"),
     ],
 )
 def test_bad_input_is_one_line(photo, arguments: tuple[str, ...], part: str):
