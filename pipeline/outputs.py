@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pipeline.bop.detections import write_detections
 from pipeline.bop.results import results_name, rows_of, write_results
 from pipeline.graph import Graph, Judged, Retraced, ScoreNodes
 from pipeline.items.poses import NoEstimate, PoseEstimate
@@ -79,8 +80,16 @@ class Outputs:
         row = done_row(self.out, row_id(self.config))
         return row if row and self.scores and row.run == self.scores.ref.key else None
 
+    def write_detections(self) -> Path:
+        """Detections that can be used, as detect=json reads them; returns their file."""
+        path = self.folder / "detections.json"
+        write_detections(path, self.graph.detections.all)
+        return path
+
     def write_files(self, answers: Sequence[Answer], judged: Judged | None) -> None:
-        """The csv and poses.json."""
+        """The csv, poses.json, and detections.json of those that were not read from a file."""
+        if self.graph.detections.proposals:
+            self.write_detections()
         estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
         write_results(self.folder / self.csv, rows_of(estimates, _seconds_by_image(answers)))
         errors = _errors(answers, judged)
@@ -99,6 +108,8 @@ class Outputs:
     def places(self, *, overlays: bool) -> str:
         """Lines that say where everything lies."""
         lines = [f"csv       {self.folder / self.csv}", f"records   {self.folder / 'poses.json'}"]
+        if self.graph.detections.proposals:
+            lines.append(f"detected  {self.folder / 'detections.json'}")
         if overlays:
             right = f"ground truth blue; green: MSSD < {CORRECT_MSSD:.0%} of the diameter"
             lines.append(f"overlays  {self.overlays}  ({right if self.scores else 'estimates'})")

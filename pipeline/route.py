@@ -29,7 +29,7 @@ from pipeline.items.poses import PoseSolution
 from pipeline.stages.cluster import Clusterer
 from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
-from pipeline.stages.detect import Detector
+from pipeline.stages.detect import DescribingDetector, Detector
 from pipeline.stages.extract import Extractor
 from pipeline.stages.fit import Fit, Fitted, chain
 from pipeline.stages.fuse import FittedFuser, Fuser
@@ -55,7 +55,7 @@ class Stages:
     correspond: Corresponder
     solve: Solver
     refine: Refiner
-    detect: Detector
+    detect: Detector | DescribingDetector
     fallback: bool = False
 
     @property

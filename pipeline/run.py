@@ -119,25 +119,42 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     print(_headline(options, stages, data, targets, store), flush=True)
     if options.plan:
         scores = _scores(graph, options)
-        print(plan_table([*graph.plan(), *([scores.node()] if scores else [])]))
+        print(plan_table([*graph.plan(), *([scores.node()] if scores and graph.detections.known else [])]))
         return
     if options.step == "onboard":
         graph.onboard()
     elif options.step == "detect":
-        print(f"{graph.detect()} detections")
+        _detect(graph, options)
     else:
         _estimate(graph, options)
     print(f"\n{graph.run.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+
+
+def _detect(graph: Graph, options: Options) -> None:
+    """Detections, and their file where they were not read from one."""
+    if graph.detections.proposals:
+        _check_folder(Path(options.out))
+    found = graph.detect()
+    without = [d for d in found if d.defect is not None]
+    print(f"{len(found) - len(without)} detections")
+    for d in without[:ROWS_SHOWN]:
+        print(f"object {d.obj_id} in scene {d.scene_id}, image {d.im_id}: {d.defect}")
+    if graph.detections.proposals:
+        print(f"written   {_outputs(graph, None, options).write_detections()}")
+
+
+def _outputs(graph: Graph, scores: ScoreNodes | None, options: Options) -> Outputs:
+    theta_max = options.evaluate.theta_max
+    return Outputs(
+        graph, scores, Path(options.out), options.name, options.config, options.label, options.sweep, theta_max
+    )
 
 
 def _estimate(graph: Graph, options: Options) -> None:
     """Poses, and unless they alone are asked for, their scores; files, pictures and tables of both."""
     _check_folder(Path(options.out))
     scores = _scores(graph, options)
-    theta_max = options.evaluate.theta_max
-    outputs = Outputs(
-        graph, scores, Path(options.out), options.name, options.config, options.label, options.sweep, theta_max
-    )
+    outputs, theta_max = _outputs(graph, scores, options), options.evaluate.theta_max
     if options.resume and scores is not None and outputs.finished():
         print(f"finished before: {outputs.row_path}")
         return

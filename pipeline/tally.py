@@ -13,6 +13,8 @@ STEPS = (
     "template crops",
     "template features",
     "fits",
+    "proposals",
+    "proposal features",
     "detections",
     "query crops",
     "query features",

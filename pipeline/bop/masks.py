@@ -41,6 +41,11 @@ def read_rle(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
     return encode(_fill(runs, h, w))
 
 
+def runs(rle: dict[str, Any]) -> dict[str, Any]:
+    """An RLE made here with its counts as a list, as BOP's files have it."""
+    return {"size": rle["size"], "counts": _uncompressed(rle["counts"])}
+
+
 def area(rle: dict[str, Any]) -> int:
     """Pixels inside the mask of an RLE made here."""
     return int(coco.area(rle))

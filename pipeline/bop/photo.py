@@ -1,4 +1,4 @@
-"""One's own mesh, photograph, camera and mask or box -> a dataset of one target."""
+"""One's own meshes, photograph, camera and perhaps a mask or box -> a dataset of one image."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from pipeline.items.views import Image, Target
 from pipeline.meshes import diameter_mm, read_mesh
 from pipeline.spec import PositiveFloat, Spec, digest, spec
 
-SCENE_ID, IM_ID, OBJ_ID = 0, 0, 1
+SCENE_ID, IM_ID = 0, 0
 _SMALLEST_MM = 2.0
 
 
 @spec
 class PhotoConfig(Spec):
-    """A mesh, a photograph, K, and where the object is: a mask, or a box.
+    """A mesh, a photograph, K, and where the object is: a mask, or a box, or neither for a detector that finds it.
 
+    ``mesh``: one file, or several for a detector that finds them all; they are objects 1, 2, ... in that order.
     ``K``: fx, fy, cx, cy or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height of its pixels.
     ``scale`` multiplies the mesh's vertices, 1000 for a mesh in metres.
     """
 
     kind: ClassVar[str] = "dataset.photo"
 
-    mesh: str
+    mesh: str | tuple[str, ...]
     image: str
     K: tuple[Any, ...]
     mask: str | None = None
@@ -48,10 +49,15 @@ class PhotoConfig(Spec):
         K = self._matrix()
         check_K(K, size_hw, "dataset.K")
         _check_principal_point(K, size_hw)
-        if (self.mask is None) == (self.bbox is None):
-            found = "neither" if self.mask is None else "both"
+        if self.mask is not None and self.bbox is not None:
             raise BadInput(
-                "dataset", found=f"{found} of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
+                "dataset", found="both of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
+            )
+        meshes = (self.mesh,) if isinstance(self.mesh, str) else self.mesh
+        if not meshes or (len(meshes) > 1 and (self.mask or self.bbox)):
+            found = f"{len(meshes)} meshes" + (" and where one object is" if meshes else "")
+            raise BadInput(
+                "dataset.mesh", found=found, needed="one mesh; several go without dataset.mask and dataset.bbox"
             )
         if self.bbox is not None and not np.isfinite(self.bbox).all():
             raise BadInput("dataset.bbox", found=list(self.bbox), needed="four finite numbers: x, y, width, height")
@@ -61,9 +67,9 @@ class PhotoConfig(Spec):
             split="test",
             models="",
             models_info={},
-            targets=(Target(SCENE_ID, IM_ID, OBJ_ID),),
+            targets=tuple(Target(SCENE_ID, IM_ID, obj_id) for obj_id in range(1, len(meshes) + 1)),
             photo_path=image,
-            mesh_path=Path(self.mesh).expanduser(),
+            mesh_paths=tuple(Path(mesh).expanduser() for mesh in meshes),
             camera_matrix=K,
             mask_file=None if self.mask is None else Path(self.mask).expanduser(),
             bbox_xyxy=None if self.bbox is None else edges(self.bbox),
@@ -94,10 +100,10 @@ def _check_principal_point(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class Photo(Dataset):
-    """A dataset of one image and one object, without ground truth."""
+    """A dataset of one image, without ground truth."""
 
     photo_path: Path = Path()
-    mesh_path: Path = Path()
+    mesh_paths: tuple[Path, ...] = ()
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     mask_file: Path | None = None
     bbox_xyxy: Box | None = None
@@ -125,8 +131,9 @@ class Photo(Dataset):
         return False
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
-        """The mesh, scaled. Raises BadInput for one too small to be in millimetres."""
-        mesh = read_mesh(self.mesh_path)
+        """An object's mesh, scaled. Raises BadInput for one too small to be in millimetres."""
+        path = self.mesh_paths[obj_id - 1]
+        mesh = read_mesh(path)
         if self.scale != 1.0:
             scaled: dict[str, Any] = {
                 "digest": digest([mesh.digest, self.scale]),
@@ -136,5 +143,5 @@ class Photo(Dataset):
         diameter = diameter_mm(mesh)
         if diameter < _SMALLEST_MM:
             found = f"a mesh of diameter {diameter:.3g} (it looks like metres)"
-            raise BadInput(self.mesh_path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
+            raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
         return ObjectModel(obj_id, mesh, diameter)

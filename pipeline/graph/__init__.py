@@ -6,6 +6,8 @@ touches no template and no backbone.
 
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
 template features -> what is fitted to them, where a stage stands on it             templates.py
+image -> proposals -> crops -> features, for a detector that describes them         proposals.py
+files, or features of proposals and templates -> detections                         detections.py
 image, detections -> query crops -> query features (by timestep and layer)          queries.py
 template features, query features, stages -> poses (by scene and object) -> run     poses.py
 poses, ground truth -> scores                                                       scores.py
@@ -15,14 +17,17 @@ from __future__ import annotations
 
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
+from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
+from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.features import SALIENCY_LAYER
 from pipeline.items.records import Answer
+from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
 from pipeline.stages.fuse import TrainedFuser
 
@@ -35,7 +40,8 @@ class Graph:
     def __init__(self, run: Context) -> None:
         self.run = run
         self.templates = TemplateNodes(run)
-        self.queries = QueryNodes(run)
+        self.detections = DetectionNodes(run, proposal_nodes(run))
+        self.queries = QueryNodes(run, self.detections)
         self.poses = PoseNodes(run, self.templates, self.queries)
 
     def check(self) -> None:
@@ -51,24 +57,24 @@ class Graph:
                 stages.extract.feature_shape(layer)
             except BadInput as fault:
                 if layer == SALIENCY_LAYER:
-                    needed = (
-                        f"an extractor with saliency (dino, dinov2) for {stages.correspond.kind}, or correspond=cosine"
-                    )
-                    raise BadInput(
-                        "correspond", found=f"{stages.extract.kind} without saliency", needed=needed
-                    ) from None
+                    found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
+                    raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
                 if "layer" in fault.where:
                     raise BadInput(asked[layer], found=fault.found, needed=fault.needed) from None
                 raise
+        if self.detections.proposals:
+            self.detections.proposals.check()
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
         for obj_id in self.run.object_ids:
             self.templates.onboard(obj_id)
+            if self.detections.proposals and not self.detections.known:
+                self.detections.proposals.make_template_features(obj_id)
 
-    def detect(self) -> int:
-        """Detections of all targets; returns how many."""
-        return len(self.queries.detections)
+    def detect(self) -> list[Detection]:
+        """Detections of all targets, those that cannot be used included."""
+        return self.detections.all
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
@@ -87,4 +93,4 @@ class Graph:
 
     def plan(self) -> list[Node]:
         """Every node with its state, key, size and cost."""
-        return Plan(self.run, self.templates, self.queries, self.poses).nodes()
+        return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.graph.context import Context, ImageId
+from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.poses import PoseNodes
+from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.store import Layout, Ref
@@ -28,16 +30,23 @@ class Node:
 
 @dataclass(eq=False)
 class Plan:
-    """Lists nodes. Detections alone are made, since the keys of all that follows depend on them."""
+    """Lists nodes. Detections alone are made, since the keys of all that follows depend on them; where they would
+    have to be computed the list ends with them.
+    """
 
     run: Context
     templates: TemplateNodes
     queries: QueryNodes
     poses: PoseNodes
+    detections: DetectionNodes
 
     def nodes(self) -> list[Node]:
         """All nodes in the order of the route."""
         nodes = [node for obj_id in self.run.object_ids for node in self._of_object(obj_id)]
+        if self.detections.proposals:
+            nodes += self._of_proposals(self.detections.proposals)
+        if not self.detections.known:
+            return nodes
         for image in self.run.image_ids:
             nodes += self._of_image(image)
         for group, targets in self.poses.groups.items():
@@ -74,6 +83,23 @@ class Plan:
             for layer in self.run.stages.layers
             if n
         ]
+
+    def _of_proposals(self, described: ProposalNodes) -> list[Node]:
+        """What detections are computed from, and they themselves."""
+        nodes = [
+            self._node(
+                "template features", f"object {obj_id} for detections", described.template_features(obj_id), 0, ""
+            )
+            for obj_id in self.run.object_ids
+        ]
+        for image in self.run.image_ids:
+            of = f"scene {image[0]} image {image[1]}"
+            nodes.append(self._node("proposals", of, described.proposals(image), 0, "1 image through the proposer"))
+            features = described.features(image)
+            nodes.append(self._node("proposal features", of, features, 0, "its proposals through the backbone"))
+        follows = "query crops, query features, poses and scores follow from them and are not listed"
+        of = f"{len(self.run.targets)} targets"
+        return [*nodes, self._node("detections", of, self.detections.ref, 0, follows)]
 
     def _features(self, step: str, of: str, ref: Ref, layer: int, rows: int) -> Node:
         return self._node(

@@ -11,7 +11,7 @@ from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import Found, QueryNodes
 from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.items.poses import NoEstimate, PoseEstimate
-from pipeline.items.records import Answer, answer_of, detection_record, record_of
+from pipeline.items.records import Answer, answer_of, record_of
 from pipeline.items.views import Detection, Target
 from pipeline.route import Query, Trace, Truth, template_pose, trace_pose
 from pipeline.spec import digest
@@ -54,7 +54,7 @@ class PoseNodes:
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.run.K(image).tolist()]
-            asked += [detection_record(d) for _, d in self._detections(target)]
+            asked += [self.queries.detecting.identity(d) for _, d in self._detections(target)]
             if stages.need_truth:
                 asked += [self._truth(d).T_cam_obj.tolist() for _, d in self._detections(target)]
                 asked += [self.run.model(obj_id).symmetries.tolist()]

@@ -1,4 +1,4 @@
-"""image -> detections -> query crops -> query features, once for every image; and queries read back from them."""
+"""image, detections -> query crops -> query features, once for every image; and queries read back from them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from pipeline.bop.masks import decode
-from pipeline.digests import file_digest, files_digest
+from pipeline.digests import file_digest
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.graph.context import Context, ImageId, stacked
-from pipeline.items.records import detection_of, detection_record
+from pipeline.graph.detections import DetectionNodes
 from pipeline.items.views import Crops, Detection, Geometry
 from pipeline.route import Query
 from pipeline.spec import digest
@@ -35,30 +35,12 @@ class QueryNodes:
     """Entries of images. Methods without a verb name entries; ``make_*`` compute what is missing."""
 
     run: Context
+    detecting: DetectionNodes
 
-    def detections_ref(self) -> Ref:
-        """All detections of the targets."""
-        root = self.run.dataset.root
-        sources = {
-            path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name: path
-            for path in self.run.stages.detect.sources(self.run.dataset, self.run.targets)
-        }
-        recipe = {"kind": "detections", "detect": self.run.stages.detect.recipe()}
-        targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.run.targets]
-        asked = digest([targets, self.run.dataset.given_bbox_xyxy])
-        return make_ref("detections", recipe, {"sources": files_digest(sources), "targets": asked})
-
-    @cached_property
+    @property
     def detections(self) -> list[Detection]:
         """Detections of the targets, made once."""
-        ref = self.detections_ref()
-        fresh = not self.run.store.complete(ref)
-        if fresh:
-            found = self.run.stages.detect(self.run.dataset, self.run.targets)
-            self.run.store.put_document(ref, [detection_record(d) for d in found], rows=len(found))
-        found = [detection_of(record) for record in self.run.store.read(ref).document]
-        self.run.tally.add("detections", **{"computed" if fresh else "reused": len(found)})
-        return found
+        return self.detecting.all
 
     @cached_property
     def of_target(self) -> dict[tuple[int, int, int], list[tuple[int, Detection]]]:

@@ -1,4 +1,4 @@
-"""Poses and detections as JSON records, and back. The one place that knows the field names on disk."""
+"""Poses, detections and proposals as JSON records, and back. The one place that knows the field names on disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.items.poses import NoEstimate, PoseEstimate
-from pipeline.items.views import Detection
+from pipeline.items.views import Detection, Proposal
 
 Answer = PoseEstimate | NoEstimate
 
@@ -44,3 +44,14 @@ def detection_of(record: Mapping[str, Any]) -> Detection:
     """The detection a record holds."""
     x0, y0, x1, y1 = record["bbox_xyxy"]
     return Detection(**{**record, "bbox_xyxy": (x0, y0, x1, y1)})
+
+
+def proposal_record(proposal: Proposal) -> dict[str, Any]:
+    """A JSON-able record of a proposal."""
+    return asdict(proposal) | {"bbox_xyxy": list(proposal.bbox_xyxy)}
+
+
+def proposal_of(record: Mapping[str, Any]) -> Proposal:
+    """The proposal a record holds."""
+    x0, y0, x1, y1 = record["bbox_xyxy"]
+    return Proposal(**{**record, "bbox_xyxy": (x0, y0, x1, y1)})

@@ -83,6 +83,18 @@ class Detection:
     defect: str | None = None
 
 
+@dataclass(frozen=True)
+class Proposal:
+    """A part of an image that may be an object, of whatever class; box and mask as in Detection.
+
+    ``confidence``: the IoU its model predicts of the mask, about 0..1 (SAM's may leave that range a little).
+    """
+
+    bbox_xyxy: tuple[float, float, float, float]
+    rle: dict[str, Any]
+    confidence: float
+
+
 @dataclass(frozen=True, eq=False)
 class Image:
     """A photograph with its camera. ``rgb`` is 8 bit; a grey image has three equal channels."""

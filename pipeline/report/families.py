@@ -36,11 +36,7 @@ def settings(row: Row) -> dict[str, Any]:
     for name, value in row.config.items():
         if name in UNTOLD or name in _SAME_SCORES:
             continue
-        if isinstance(value, Mapping) and "_target_" in value:
-            found[name] = value["_target_"].rsplit(".", 2)[-2]
-            found |= {f"{name}.{field}": _plain(v) for field, v in value.items() if field != "_target_"}
-        else:
-            found[name] = _plain(value)
+        found |= _flat(name, value)
     for name, fields in _MESHES.items():
         group = row.config.get(name) or {}
         found |= {f"{name}.{field}": group[field] for field in fields if field in group}
@@ -54,13 +50,8 @@ def scored_by(row: Row) -> dict[str, Any]:
 
 def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
     """``theirs`` where it differs from ``ours``; another variant is one difference, whatever its fields are."""
-    stages = {name for name in {*ours, *theirs} if "." not in name and ours.get(name) != theirs.get(name)}
-    fields = {
-        name
-        for name in {*ours, *theirs}
-        if "." in name and name.split(".")[0] not in stages and ours.get(name) != theirs.get(name)
-    }
-    return {name: theirs.get(name) for name in sorted(stages | fields)}
+    other = {name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name)}
+    return {name: theirs.get(name) for name in sorted(other) if not any(name.startswith(f"{o}.") for o in other)}
 
 
 def base_of(rows: Sequence[Row]) -> Row:
@@ -118,6 +109,16 @@ def _around(base: Row, rows: Sequence[Row]) -> list[Family]:
 def _order(value: Any) -> tuple[int, float, str]:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return (0, float(value), "") if is_number else (1, 0.0, str(value))
+
+
+def _flat(name: str, value: Any) -> dict[str, Any]:
+    """A variant by its name, its fields and those of variants within it by dotted names; anything else as it is."""
+    if not (isinstance(value, Mapping) and "_target_" in value):
+        return {name: _plain(value)}
+    found = {name: value["_target_"].rsplit(".", 2)[-2]}
+    for field, inner in value.items():
+        found |= _flat(f"{name}.{field}", inner) if field != "_target_" else {}
+    return found
 
 
 def _plain(value: Any) -> Any:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pycocotools import mask as coco
 
-from pipeline.bop.masks import area, decode, encode, read_rle
+from pipeline.bop.masks import area, decode, encode, read_rle, runs
 
 
 def uncompressed(mask: np.ndarray) -> list[int]:
@@ -30,6 +30,7 @@ def test_every_way_to_write_a_mask_reads_the_same(h: int, w: int, bits: int):
     for given_rle in (compressed, as_list, padded):
         assert read_rle(given_rle, (h, w)) == compressed
     np.testing.assert_array_equal(decode(compressed), mask)
+    assert runs(compressed) == as_list
     assert area(compressed) == mask.sum()
 
 

@@ -29,6 +29,15 @@ def test_another_variant_is_one_step_whatever_its_fields():
     assert (family.axis, set(family.values), family.numeric) == ("solve", {"epnp", "poselib"}, False)
 
 
+def test_another_variant_within_a_variant_is_one_step_too():
+    hog, dino = ({"_target_": f"a.{name}.A", "size": i} for i, name in enumerate(("hog", "dino")))
+    base = toy_row(detect={"_target_": "d.cnos.D", "min_score": 0.1, "describe": hog})
+    other = toy_row(detect={"_target_": "d.cnos.D", "min_score": 0.1, "describe": dino})
+    assert difference(settings(base), settings(other)) == {"detect.describe": "dino"}
+    larger = toy_row(detect={"_target_": "d.cnos.D", "min_score": 0.1, "describe": {**hog, "size": 7}})
+    assert difference(settings(base), settings(larger)) == {"detect.describe.size": 7}
+
+
 def test_runs_two_steps_away_belong_to_no_family_of_the_base():
     rows = [toy_row(), toy_row(cluster__count=40), toy_row(cluster__count=80, fuse__dim=32)]
     assert [family.values for family in families(rows)] == [(40, 200)]

@@ -37,6 +37,9 @@ class PhotoMask(Spec):
 def _photo(dataset: Dataset) -> Photo:
     if not isinstance(dataset, Photo):
         raise BadInput("detect", found="photo for a dataset that is none", needed="dataset=photo, or another detect")
+    if dataset.mask_file is None and dataset.bbox_xyxy is None:
+        needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=cnos, which finds the object"
+        raise BadInput("dataset", found="neither of mask and bbox", needed=needed)
     return dataset
 
 

@@ -1,0 +1,29 @@
+"""One vector for a whole crop, and how much it looks like an object known by many templates."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.functional.masks import cell_mask
+from pipeline.functional.similarity import unit
+
+
+def pooled(maps: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n S S"]) -> Float[Tensor, "n c"]:
+    """Mean feature of each crop's foreground cells; of a map of one cell, as a class token is, that cell.
+
+    Zeros for a crop without a pixel of mask.
+    """
+    inside = cell_mask(mask, cells=maps.shape[-1]).float()
+    total = torch.einsum("nchw,nhw->nc", maps.float(), inside)
+    return total / inside.sum((1, 2)).clamp(min=1)[:, None]
+
+
+def mean_of_best(query: Float[Tensor, "p c"], templates: Float[Tensor, "n c"], *, best: int) -> Float[Tensor, " p"]:
+    """Mean of each query's ``best`` highest cosines with the templates, of all where there are fewer.
+
+    Negative cosines count as 0. Nguyen et al., ICCVW 2023, "CNOS", section 3.3, with ``best`` 5.
+    """
+    cosine = (unit(query) @ unit(templates).T).clamp(0, 1)
+    return cosine.topk(min(best, len(templates)), dim=1).values.mean(1)

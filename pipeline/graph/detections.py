@@ -1,0 +1,85 @@
+"""targets -> detections, of files or of proposals that look like templates: one entry for all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from pipeline.digests import files_digest
+from pipeline.graph.context import Context
+from pipeline.graph.proposals import ProposalNodes
+from pipeline.items.records import detection_of, detection_record
+from pipeline.items.views import Detection
+from pipeline.spec import digest
+from pipeline.stages.detect import DescribingDetector
+from pipeline.store import Ref, make_ref
+
+
+@dataclass(eq=False)
+class DetectionNodes:
+    """The entry of a run's detections. ``proposals``: what a detector that describes stands on, None for others."""
+
+    run: Context
+    proposals: ProposalNodes | None
+
+    @cached_property
+    def ref(self) -> Ref:
+        """All detections of the targets."""
+        recipe = {"kind": "detections", "detect": self.run.stages.detect.recipe()}
+        targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.run.targets]
+        return make_ref("detections", recipe, self._sources() | {"targets": self._asked(targets)})
+
+    def _asked(self, targets: list[list[int]]) -> str:
+        return digest([targets, None if self.proposals else self.run.dataset.given_bbox_xyxy])
+
+    def _sources(self) -> dict[str, str]:
+        """What decides the answer beside the targets."""
+        detect, root = self.run.stages.detect, self.run.dataset.root
+        if not isinstance(detect, DescribingDetector):
+            files = detect.sources(self.run.dataset, self.run.targets)
+            named = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
+            return {"sources": files_digest(named)}
+        assert self.proposals is not None
+        objects = {f"object {obj_id}": self.proposals.template_features(obj_id).key for obj_id in self.run.object_ids}
+        images = {f"image {s}/{i}": self.proposals.features((s, i)).key for s, i in self.run.image_ids}
+        return objects | images
+
+    @property
+    def known(self) -> bool:
+        """Whether they can be had without proposing or describing anything."""
+        return self.proposals is None or self.run.store.complete(self.ref)
+
+    @cached_property
+    def all(self) -> list[Detection]:
+        """Detections of the targets, made once."""
+        fresh = not self.run.store.complete(self.ref)
+        if fresh:
+            found = self._find()
+            self.run.store.put_document(self.ref, [detection_record(d) for d in found], rows=len(found))
+        found = [detection_of(record) for record in self.run.store.read(self.ref).document]
+        self.run.tally.add("detections", **{"computed" if fresh else "reused": len(found)})
+        return found
+
+    def identity(self, detection: Detection) -> dict[str, Any]:
+        """What poses depend on: seconds that were measured here, other in every run, are no part of it."""
+        record = detection_record(detection)
+        return record | {"time_s": 0.0} if self.proposals else record
+
+    def _find(self) -> list[Detection]:
+        detect = self.run.stages.detect
+        if not isinstance(detect, DescribingDetector):
+            return detect(self.run.dataset, self.run.targets)
+        assert self.proposals is not None
+        for obj_id in self.run.object_ids:
+            self.proposals.make_template_features(obj_id)
+        templates = {obj_id: self.proposals.template_descriptors(obj_id) for obj_id in self.run.object_ids}
+        found: list[Detection] = []
+        with self.run.tally.bar(len(self.run.image_ids), "detections", "image") as advance:
+            for image in self.run.image_ids:
+                self.proposals.make(image)
+                targets = [t for t in self.run.targets if (t.scene_id, t.im_id) == image]
+                described = self.proposals.described(image)
+                found += detect.by_description(targets, *described, templates, self.proposals.time_s(image))
+                advance(1)
+        return found

@@ -1,0 +1,186 @@
+"""image -> proposals -> crops -> features, and the descriptors of them and of templates that detections come of."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import cast
+
+import torch
+from jaxtyping import Float
+
+from pipeline.bop.masks import decode
+from pipeline.digests import file_digest
+from pipeline.errors import BadInput, NoPose
+from pipeline.functional.descriptors import pooled
+from pipeline.graph.context import Context, ImageId, stacked
+from pipeline.graph.templates import TemplateNodes
+from pipeline.items.records import proposal_of, proposal_record
+from pipeline.items.views import Crops, Proposal
+from pipeline.spec import digest
+from pipeline.stages.detect import DescribingDetector
+from pipeline.stages.detect.proposals import Proposing
+from pipeline.stages.extract import Extractor
+from pipeline.store import Ref, make_ref
+
+
+@dataclass(eq=False)
+class ProposalNodes:
+    """Entries that a describing detector stands on. Methods without a verb name entries.
+
+    ``run`` has the detector's extractor in the place of the route's: templates and their crops are the route's own
+    entries, and so are their features where the two extractors are one.
+    """
+
+    run: Context
+    detector: DescribingDetector
+
+    @cached_property
+    def templates(self) -> TemplateNodes:
+        """Entries of objects under the detector's extractor."""
+        return TemplateNodes(self.run)
+
+    @cached_property
+    def proposing(self) -> Proposing:
+        """The proposer with its weights, loaded when the first image lacks its proposals."""
+        return self.detector.proposals.load(self.run.runtime)
+
+    def check(self) -> None:
+        """Raise BadInput for weights or a layer that are not there, and for a descriptor that sees the truth."""
+        extract, layer = self.run.stages.extract, self.detector.describe_layer
+        if extract.needs_geometry:
+            raise BadInput("detect.describe", found=f"{extract.kind}, an oracle", needed="an extractor of photographs")
+        try:
+            extract.feature_shape(layer)
+        except BadInput as fault:
+            if "layer" not in fault.where:
+                raise
+            needed = f"{fault.needed}; or an extractor that has it (extract@detect.describe=NAME)"
+            raise BadInput("detect.describe_layer", found=fault.found, needed=needed) from None
+        self.detector.proposals.recipe()
+
+    # --- objects ---------------------------------------------------------------------------------------------------
+
+    def template_features(self, obj_id: int) -> Ref:
+        """Features of an object's templates that descriptors are read from."""
+        return self.templates.features(obj_id, self.detector.describe_layer)
+
+    def make_template_features(self, obj_id: int) -> None:
+        """Render, crop and describe what is missing of an object's templates."""
+        count = self.templates.make_templates(obj_id)
+        self.templates.make_crops(obj_id, count)
+        self.templates.make_features(obj_id, count, [self.detector.describe_layer])
+
+    def template_descriptors(self, obj_id: int) -> Float[torch.Tensor, "n c"]:
+        """One vector for each of an object's templates."""
+        return self._descriptors(self.templates.crops(obj_id), self.template_features(obj_id))
+
+    # --- images ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def proposals(self) -> Callable[[ImageId], Ref]:
+        """Proposals of an image."""
+        return lru_cache(maxsize=None)(self._proposals)
+
+    def _proposals(self, image: ImageId) -> Ref:
+        recipe = {"kind": "proposals", "proposals": self.detector.proposals.recipe()}
+        return make_ref("proposals", recipe, {"image": file_digest(self.run.dataset.image_path(*image))})
+
+    def crops(self, image: ImageId) -> Ref:
+        """Their crops."""
+        recipe = {"kind": "proposal crops", "crop": self.run.stages.crop.recipe()}
+        inputs = {"proposals": self.proposals(image).key}
+        if self.run.stages.crop.needs_camera:
+            inputs["camera"] = digest(self.run.K(image).tolist())
+        return make_ref("crops", recipe, inputs)
+
+    def features(self, image: ImageId) -> Ref:
+        """Features of these that descriptors are read from; none for an image without a crop."""
+        return self.run.features(self.detector.describe_layer, {"crops": self.crops(image).key})
+
+    def make(self, image: ImageId) -> None:
+        """Propose, crop and describe what is missing of an image's proposals."""
+        rows = self._make_crops(image, self._make_proposals(image))
+        if rows:
+            refs = {self.detector.describe_layer: self.features(image)}
+            self.run.extract("proposal features", "", refs, rows, lambda some: self._crops_of(image, some))
+
+    def described(self, image: ImageId) -> tuple[list[Proposal], Float[torch.Tensor, "p c"]]:
+        """An image's proposals that have a crop, and one vector for each."""
+        kept = self.run.store.read(self.crops(image)).document["kept"]
+        proposals = [proposal_of(record) for record in self.run.store.read(self.proposals(image)).document]
+        if not kept:
+            channels = self.run.stages.extract.feature_shape(self.detector.describe_layer)[0]
+            return [], torch.zeros((0, channels), device=self.run.device)
+        return [proposals[i] for i in kept], self._descriptors(self.crops(image), self.features(image))
+
+    def time_s(self, image: ImageId) -> float:
+        """Seconds that an image's proposals and their features took."""
+        crops = self.run.store.read(self.crops(image))
+        features = self.run.store.read(self.features(image)).time_s if crops.rows else 0.0
+        return self.run.store.read(self.proposals(image)).time_s + crops.time_s + features
+
+    def _make_proposals(self, image: ImageId) -> list[Proposal]:
+        ref = self.proposals(image)
+        fresh = not self.run.store.complete(ref)
+        if fresh:
+            propose = self.proposing  # loading its weights is no part of an image's seconds
+            start = time.perf_counter()
+            found = propose(self.run.dataset.image(*image))
+            seconds = time.perf_counter() - start
+            records = [proposal_record(proposal) for proposal in found]
+            self.run.store.put_document(ref, records, rows=len(found), time_s=seconds)
+        entry = self.run.store.read(ref)
+        counted = {"computed" if fresh else "reused": entry.rows}
+        self.run.tally.add("proposals", **counted, time_s=entry.time_s if fresh else 0.0)
+        return [proposal_of(record) for record in entry.document]
+
+    def _make_crops(self, image: ImageId, proposals: Sequence[Proposal]) -> int:
+        """Crop an image's proposals; returns how many could be cropped."""
+        ref = self.crops(image)
+        if self.run.store.complete(ref):
+            return self.run.store.read(ref).rows
+        start = time.perf_counter()
+        photo = self.run.dataset.image(*image)
+        crops, kept = [], []
+        for position, proposal in enumerate(proposals):
+            try:
+                crops.append(self.run.stages.crop(photo.rgb, decode(proposal.rle), proposal.bbox_xyxy, photo.K))
+                kept.append(position)
+            except NoPose:
+                continue  # it cannot be an object that a pose could be found of
+        if not crops:
+            self.run.store.put_document(ref, {"kept": []}, rows=0, time_s=time.perf_counter() - start)
+            return 0
+        arrays = stacked(crops)
+        self.run.store.fill(
+            {ref: self.run.crops_layout()},
+            rows=len(crops),
+            batch=len(crops),
+            compute=lambda rows: {ref.key: {name: values[rows] for name, values in arrays.items()}},
+            document={"kept": kept},
+        )
+        return len(crops)
+
+    def _crops_of(self, image: ImageId, rows: Sequence[int]) -> Crops:
+        entry = self.run.store.read(self.crops(image))
+        return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows))
+
+    def _descriptors(self, crops: Ref, features: Ref) -> Float[torch.Tensor, "n c"]:
+        maps = self.run.tensor(self.run.store.read(features).array("maps"))
+        return pooled(maps, self.run.tensor(self.run.store.read(crops).array("mask")))
+
+
+def proposal_nodes(run: Context) -> ProposalNodes | None:
+    """Nodes of the run's detector where it is one that describes."""
+    detector = run.stages.detect
+    if not isinstance(detector, DescribingDetector):
+        return None
+    extract = cast(Extractor, detector.describe)
+    if extract == run.stages.extract:
+        return ProposalNodes(run, detector)  # one backbone in memory
+    describing = replace(run, stages=replace(run.stages, extract=extract))
+    describing.model = run.model  # meshes are read once
+    return ProposalNodes(describing, detector)

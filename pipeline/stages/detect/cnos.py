@@ -1,0 +1,113 @@
+"""proposals, templates -> detections (Nguyen et al., ICCVW 2023, "CNOS")."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.functional.boxes import not_suppressed
+from pipeline.functional.descriptors import mean_of_best
+from pipeline.items.features import CLASS_TOKEN_LAYER
+from pipeline.items.views import Detection, Proposal, Target
+from pipeline.spec import Fraction, Positive, Spec, spec
+from pipeline.stages.detect.proposals import Proposer
+from pipeline.stages.detect.proposals.sam import Sam
+
+
+@spec
+class Cnos(Spec):
+    """Every proposal goes to the object of the run whose templates it looks most like, if it looks like it enough.
+
+    ``describe``: the extract variant that describes proposals and templates; ``describe_layer``: its class token (-2),
+    or a layer, averaged over the mask. A proposal's score for an object is the mean of its ``best`` highest cosines
+    with the object's templates; ``min_score``: it must exceed it. ``nms_iou``: of two boxes of one object that
+    overlap more the one of lower score goes. ``max_per_image``: detections of the targets' objects that an image keeps
+    at most. ``keep``: and of those each target, as in detect=json.
+
+    Departures from the paper: its templates are the route's, and crops are the route's crops.
+    """
+
+    kind: ClassVar[str] = "detect.cnos"
+    version: ClassVar[int] = 1
+
+    describe: Spec
+    proposals: Proposer = field(default_factory=Sam)
+    describe_layer: int = CLASS_TOKEN_LAYER
+    best: Positive = 5
+    min_score: Fraction = 0.15
+    nms_iou: Fraction = 0.25
+    max_per_image: Positive = 100
+    keep: Literal["inst_count", "all"] | Positive = "inst_count"
+
+    def by_description(
+        self,
+        targets: Sequence[Target],
+        proposals: Sequence[Proposal],
+        described: Float[Tensor, "p c"],
+        templates: Mapping[int, Float[Tensor, "n c"]],
+        time_s: float,
+    ) -> list[Detection]:
+        """See DescribingDetector."""
+        assigned = _assigned(described, templates, best=self.best)
+        ranked = self._ranked(targets, proposals, assigned)
+        found: list[Detection] = []
+        for target in targets:
+            ids = target.scene_id, target.im_id, target.obj_id
+            mine = [i for i in ranked if assigned.obj_id[i] == target.obj_id][: self._count(target)]
+            found += [
+                Detection(*ids, float(assigned.score[i]), time_s, proposals[i].bbox_xyxy, proposals[i].rle)
+                for i in mine
+            ]
+            if not mine:
+                reason = self._reason(target, assigned)
+                found.append(Detection(*ids, 0.0, time_s, (0.0, 0.0, 0.0, 0.0), defect=reason))
+        return found
+
+    def _ranked(self, targets: Sequence[Target], proposals: Sequence[Proposal], assigned: _Assigned) -> list[int]:
+        """Proposals that are detections of the targets' objects, best score first."""
+        boxes = np.array([p.bbox_xyxy for p in proposals]).reshape(-1, 4)
+        left = np.zeros(len(proposals), bool)
+        for obj_id in {target.obj_id for target in targets}:
+            mine = np.flatnonzero((assigned.obj_id == obj_id) & (assigned.score > self.min_score))
+            left[mine] = not_suppressed(boxes[mine], assigned.score[mine], max_iou=self.nms_iou)
+        best_first = np.argsort(-assigned.score, kind="stable").tolist()
+        return [i for i in best_first if left[i]][: self.max_per_image]
+
+    def _count(self, target: Target) -> int | None:
+        if self.keep == "all":
+            return None
+        return target.inst_count if self.keep == "inst_count" else self.keep
+
+    def _reason(self, target: Target, assigned: _Assigned) -> str:
+        """Why a target has no detection."""
+        proposals, scores = len(assigned.score), assigned.score[assigned.obj_id == target.obj_id]
+        if not proposals:
+            return "no mask was proposed in the image"
+        if not len(scores):
+            return f"each of {proposals} proposals looks more like another object than like object {target.obj_id}"
+        if scores.max() <= self.min_score:
+            return f"the best of {proposals} proposals scores {scores.max():.2f}, needs more than {self.min_score:g}"
+        return f"the image has {self.max_per_image} detections of higher score, all that it may have"
+
+
+@dataclass(frozen=True, eq=False)
+class _Assigned:
+    """Each proposal's best object and its score for it."""
+
+    obj_id: Int[np.ndarray, " p"]
+    score: Float[np.ndarray, " p"]
+
+
+def _assigned(
+    described: Float[Tensor, "p c"], templates: Mapping[int, Float[Tensor, "n c"]], *, best: int
+) -> _Assigned:
+    objects = sorted(templates)
+    scores = torch.stack([mean_of_best(described, templates[obj_id], best=best) for obj_id in objects], dim=1)
+    found = scores.max(dim=1)
+    return _Assigned(np.array(objects)[found.indices.cpu().numpy()], found.values.double().cpu().numpy())

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+
+from pipeline.functional.boxes import area, iou, not_suppressed
+
+
+def some_boxes(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    low = rng.integers(0, 30, (n, 2))
+    return np.concatenate([low, low + rng.integers(1, 20, (n, 2))], axis=1) - 0.5
+
+
+def pixels(box: np.ndarray) -> np.ndarray:
+    """The box as a mask: pixel i covers [i - 0.5, i + 0.5]."""
+    x0, y0, x1, y1 = (box + 0.5).astype(int)
+    mask = np.zeros((60, 60), bool)
+    mask[y0:y1, x0:x1] = True
+    return mask
+
+
+def suppressed_by_loop(boxes: np.ndarray, score: np.ndarray, max_iou: float) -> np.ndarray:
+    masks = [pixels(box) for box in boxes]
+    kept: list[int] = []
+    for i in sorted(range(len(boxes)), key=lambda i: -score[i]):
+        overlaps = [(masks[i] & masks[j]).sum() / (masks[i] | masks[j]).sum() for j in kept]
+        if all(overlap <= max_iou for overlap in overlaps):
+            kept.append(i)
+    return np.isin(np.arange(len(boxes)), kept)
+
+
+@pytest.mark.parametrize("max_iou", [0.0, 0.25, 0.7, 1.0])
+def test_suppression_is_that_of_a_loop_over_masks(max_iou: float):
+    boxes, score = some_boxes(80), np.random.default_rng(1).random(80)
+    np.testing.assert_array_equal(
+        not_suppressed(boxes, score, max_iou=max_iou), suppressed_by_loop(boxes, score, max_iou)
+    )
+
+
+def test_order_of_boxes_changes_nothing():
+    boxes, score = some_boxes(50), np.random.default_rng(1).permutation(50) / 50
+    order = np.random.default_rng(2).permutation(50)
+    kept = not_suppressed(boxes, score, max_iou=0.3)
+    np.testing.assert_array_equal(not_suppressed(boxes[order], score[order], max_iou=0.3), kept[order])
+
+
+def test_overlap_is_that_of_pixels():
+    boxes = some_boxes(20)
+    counted = [(pixels(boxes[0]) & pixels(b)).sum() / (pixels(boxes[0]) | pixels(b)).sum() for b in boxes]
+    np.testing.assert_allclose(iou(boxes[0], boxes), counted, atol=1e-12)
+    np.testing.assert_array_equal(area(boxes), [pixels(b).sum() for b in boxes])
+
+
+def test_of_equal_scores_the_first_stays():
+    boxes = np.repeat(some_boxes(1), 3, axis=0)
+    assert not_suppressed(boxes, np.ones(3), max_iou=0.5).tolist() == [True, False, False]
+
+
+def test_boxes_without_area_and_no_boxes_at_all_are_no_fault():
+    assert iou(np.zeros(4), np.zeros((2, 4))).tolist() == [0, 0]
+    assert not_suppressed(np.zeros((0, 4)), np.zeros(0), max_iou=0.5).tolist() == []
