@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder report test test-fast lint clean
+.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder comparison report test test-fast lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -62,6 +62,9 @@ train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints;
 
 benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights; ARGS="--lmo ... --detections ..."
 	$(PY) -m pipeline.benchmark $(ARGS)
+
+comparison: $(STAMP) ## dzop, zs6d, foundpose and fused features on the same detections, one page; wants weights: README
+	@( $(call sweep,backbones) ); status=$$?; $(PY) -m pipeline dataset=demo step=report $(ARGS); exit $$status
 
 report: $(STAMP) ## one page of all runs below results/: results/report/index.html
 	$(PY) -m pipeline step=report $(ARGS)

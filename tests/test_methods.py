@@ -1,0 +1,81 @@
+"""Every method of the comparison runs by one override, on small random weights of the classes it asks for."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command import Ran, run_dzop
+from make_weights import write_weights
+from tiny_bop import write_tiny_bop
+
+from pipeline.bop.dataset import open_dataset
+from pipeline.bop.lint import lint
+from pipeline.report.rows import read_rows
+
+SMALL = ("render=raycast", "render.count=9", "render.size=96", "overlays=false", "gallery=0", "fallback=true",
+         "evaluate.vsd=false")  # fmt: skip
+METHODS = {
+    "dzop": (),
+    "dzop_x": (),
+    "dzop_sd": ("extract.input_size=256",),
+    "zs6d": ("extract.input_size=112",),
+    "foundpose": ("extract.input_size=112", "crop.size=96", "render.inplane=1", "match.count=50"),
+    "fusion": ("extract.first.input_size=256", "extract.second.input_size=112"),
+}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> list[str]:
+    return write_weights(tmp_path_factory.mktemp("weights"))
+
+
+@pytest.fixture
+def dzop(capsys, monkeypatch, tmp_path, weights):
+    root = write_tiny_bop(tmp_path / "tiny")
+
+    def run(*arguments: str) -> Ran:
+        where = ("dataset=bop", "dataset.name=tiny", f"dataset.root={root}", f"store.root={tmp_path}/cache",
+                 f"out={tmp_path}/results", *weights)  # fmt: skip
+        return run_dzop(capsys, monkeypatch, *where, *SMALL, *arguments)
+
+    return run
+
+
+def detections(path: Path) -> Path:
+    """Of a detector: a box for every instance."""
+    found = [(0, 1, [10, 10, 14, 16]), (0, 1, [34, 12, 14, 16]), (0, 2, [26, 8, 8, 10]), (3, 2, [28, 18, 10, 10])]
+    entries = [
+        {"scene_id": 7, "image_id": im, "category_id": obj, "score": 0.9, "bbox": box, "time": 0.1}
+        for im, obj, box in found
+    ]
+    path.write_text(json.dumps(entries))
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_is_one_override_on_masks_and_on_detections(dzop, tmp_path, method):
+    for detect in ((), ("detect=json", f"detect.path={detections(tmp_path / 'found.json')}")):
+        ran = dzop(f"method={method}", *METHODS[method], *detect)
+        assert ran.status == 0, ran.err
+        row = max(read_rows(tmp_path / "results"), key=lambda row: row.at)
+        assert (row.status, row.config["method"]) == ("done", method)
+        csv = tmp_path / "results" / row.folder / row.csv
+        assert lint(csv, open_dataset(tmp_path / "tiny", name="tiny")).faults == []
+
+
+@pytest.mark.slow
+def test_templates_are_rendered_once_for_dzop_and_zs6d(dzop):
+    first = dzop("method=dzop", "step=onboard").counts()[-1]
+    second = dzop("method=zs6d", "step=onboard", *METHODS["zs6d"]).counts()[-1]
+    assert first["templates"] == second["templates"][::-1] == (18, 0)
+    assert second["template crops"][0] == 0
+    assert second["template features"][0] > 0
+
+
+def test_a_method_that_needs_saliency_says_who_has_it(dzop):
+    ran = dzop("method=dzop", "correspond=salient", "extract=hog")
+    assert ran.status == 1
+    assert (
+        "correspond: found correspond.salient, and extract.hog has no saliency, needs extract=dino or dinov2" in ran.err
+    )
