@@ -61,7 +61,7 @@ def test_a_method_is_one_override_on_masks_and_on_detections(dzop, tmp_path, met
         row = max(read_rows(tmp_path / "results"), key=lambda row: row.at)
         assert (row.status, row.config["method"]) == ("done", method)
         csv = tmp_path / "results" / row.folder / row.csv
-        assert lint(csv, open_dataset(tmp_path / "tiny", name="tiny")).faults == []
+        assert lint(csv, open_dataset(tmp_path / "tiny", name="tiny")).faults == ()
 
 
 @pytest.mark.slow
