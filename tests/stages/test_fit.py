@@ -7,6 +7,7 @@ from sklearn.feature_extraction.text import TfidfTransformer
 from pipeline.errors import DzopError
 from pipeline.functional.masks import cell_mask
 from pipeline.items.features import TemplateCells
+from pipeline.spec import digest
 from pipeline.stages.fit import chain, fitted_to, foreground_cells
 from pipeline.stages.fit.projection import Projection, on_axes
 from pipeline.stages.fuse.template_pca import TemplatePca
@@ -74,3 +75,14 @@ def test_fits_are_the_same_bytes_every_time_and_shared_where_their_recipes_are()
     assert not torch.equal(first["words"], other["words"])
     assert chain(fit) == (TemplatePca(layers=(11,), dim=6).fit, fit)
     assert Words(top_k=1).fit == Words(top_k=9).fit  # a sweep over what is kept fits nothing again
+
+
+def test_fits_are_those_of_their_version():
+    """When this fails on purpose, raise the fit's own version, beside that of the stage: stored fits are kept by it."""
+    fit = Words(dim=6, count=20, weights="gaussian").fit
+    arrays = fitted_to(fit, foreground_cells(*_bank()))
+    assert (fit.version, fit.projection.version) == (1, 1)
+    assert digest(fit.recipe()) == "f5e6bb37a1953ede9dc1ef4cebaf742da33651dac773e78f721fd014997c2314"
+    found = [float(arrays[name].abs().double().sum()) for name in ("mean", "axes", "words", "idf", "templates")]
+    # float32 sums differ between processors; a change of method moves far more
+    assert found == pytest.approx([71.909, 7.92, 50.163, 9.091, 30.547], rel=2e-3)
