@@ -17,6 +17,7 @@ from pipeline.synthetic.scenes import write_dataset
 SMALL = (
     "render.count=12",
     "render.size=128",
+    "method=dzop",
     "extract=hog",
     "overlays=false",
     "runtime.progress=false",

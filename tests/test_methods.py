@@ -29,6 +29,11 @@ def weights(tmp_path_factory) -> list[str]:
     return write_weights(tmp_path_factory.mktemp("weights"))
 
 
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture
 def dzop(capsys, monkeypatch, tmp_path, weights):
     root = write_tiny_bop(tmp_path / "tiny")
@@ -79,3 +84,34 @@ def test_a_method_that_needs_saliency_says_who_has_it(dzop):
     assert (
         "correspond: found correspond.salient, and extract.hog has no saliency, needs extract=dino or dinov2" in ran.err
     )
+
+
+CNOS = ("detect=cnos", "detect.proposals.points_per_side=3", "detect.proposals.min_iou=0", "detect.min_score=0",
+        "detect.proposals.min_stability=0", "extract@detect.describe=pixels", "detect.describe_layer=8")  # fmt: skip
+DETECTIONS = "lmo/detections/sam_lmo-test.json"
+RUNS = [
+    *((method, "ycbv", 14, ()) for method in ("dzop", "zs6d", "foundpose", "fusion")),
+    *((method, "lmo", 1, ()) for method in ("zs6d", "foundpose", "fusion")),
+    ("dzop", "lmo", 1, ("detect=json", f"detect.path={{bop_mini}}/{DETECTIONS}")),
+    ("dzop", "lmo", 1, CNOS),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "name", "obj_id", "detect"), RUNS)
+def test_a_method_answers_photographs(
+    bop_mini, capsys, monkeypatch, tmp_path, cache, weights, method, name, obj_id, detect
+):
+    monkeypatch.chdir(tmp_path)
+    data = open_dataset(bop_mini / name, name=name)
+    im_id = next(target.im_id for target in data.targets if target.obj_id == obj_id)
+    asked = (f"dataset={name}", f"dataset.root={bop_mini / name}", f"select.objects=[{obj_id}]",
+             f"select.images=[{im_id}]", f"store.root={cache}")  # fmt: skip
+    detect = [override.format(bop_mini=bop_mini) for override in detect]
+    ran = run_dzop(capsys, monkeypatch, *asked, *detect, *weights, *SMALL, f"method={method}", *METHODS[method])
+    assert ran.status == 0, ran.err
+    row = read_rows(tmp_path / "results")[0]
+    assert row.estimates + sum(count for _, _, count in row.failures) == 1
+    found = lint(tmp_path / "results" / row.folder / row.csv, data)
+    assert row.estimates == found.rows
+    assert not [fault for fault in found.faults if "found no estimate" not in fault]

@@ -9,7 +9,14 @@ from command import run_dzop
 
 from pipeline.bop.results import read_results
 
-QUICK = ("extract=hog", "render.viewpoints=fibonacci", "render.count=30", "render.size=128", "runtime.progress=false")
+QUICK = (
+    "method=dzop",
+    "extract=hog",
+    "render.viewpoints=fibonacci",
+    "render.count=30",
+    "render.size=128",
+    "runtime.progress=false",
+)
 
 
 @pytest.mark.slow
@@ -43,7 +50,14 @@ def test_every_target_has_a_pose_or_a_reason(bop_mini, capsys, monkeypatch, tmp_
 @pytest.mark.slow
 def test_hog_with_the_papers_views_finds_an_object_near_where_it_is(bop_mini, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    chosen = ("extract=hog", "select.objects=[5]", "overlays=false", "render.size=128", "runtime.progress=false")
+    chosen = (
+        "method=dzop",
+        "extract=hog",
+        "select.objects=[5]",
+        "overlays=false",
+        "render.size=128",
+        "runtime.progress=false",
+    )
     run_dzop(capsys, monkeypatch, "dataset=lmo", f"dataset.root={bop_mini / 'lmo'}", *chosen)
     record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
     relative = [a["errors"]["mssd_mm"] / a["errors"]["diameter_mm"] for a in record["answers"] if a.get("errors")]

@@ -14,8 +14,8 @@ from pipeline.report.rows import read_rows
 from pipeline.synthetic.scenes import write_dataset
 
 ROOT = Path(__file__).parents[1]
-SMALL = ("render.count=12", "render.size=128", "extract=hog", "overlays=false", "gallery=0", "runtime.progress=false",
-         "threads=1")  # fmt: skip
+SMALL = ("render.count=12", "render.size=128", "method=dzop", "extract=hog", "overlays=false", "gallery=0",
+         "runtime.progress=false", "threads=1")  # fmt: skip
 
 JOBLIB = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
 

@@ -67,7 +67,7 @@ def base_of(rows: Sequence[Row]) -> Row:
 
 def is_oracle(row: Row) -> bool:
     """Whether any stage of a run was shown the truth."""
-    return "oracle" in row.label.values() or row.label.get("extract") == "coordinates"
+    return "oracle" in row.label.values() or "extract.coordinates." in str(row.config.get("extract"))
 
 
 def is_plain(row: Row) -> bool:

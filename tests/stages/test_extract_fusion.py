@@ -158,7 +158,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def dzop(capsys, monkeypatch, tmp_path, scene):
     monkeypatch.chdir(tmp_path)
-    small = ("render.count=6", "render.size=64", "overlays=false", "runtime.progress=false", "runtime.device=cpu")
+    small = (
+        "method=dzop",
+        "render.count=6",
+        "render.size=64",
+        "overlays=false",
+        "runtime.progress=false",
+        "runtime.device=cpu",
+    )
 
     def run(*arguments: str) -> Ran:
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", *small)
