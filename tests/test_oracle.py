@@ -127,3 +127,28 @@ def test_a_query_magnified_by_three_against_its_own_template_comes_back_within_a
     )
     # every cell meets itself: what is left is rounding, and the half pixel that a wrong convention would cost is 1.5 px
     assert np.linalg.norm(found - true, axis=1).max() < 0.01
+
+
+class Shifted(NoRefinement):
+    """A refiner that moves whatever it is given by 3 mm."""
+
+    def __call__(self, T_cam_obj, pair, points_obj, K_crop, *, crop_size):
+        return rigid.rigid(np.eye(3), np.array([3.0, 0, 0])) @ T_cam_obj
+
+
+def test_the_refined_pose_is_answered_with_the_solvers_inliers_and_its_own_reprojection():
+    query, template = magnified_query(2)
+    plain, shifted = (
+        trace_pose(Stages(**{**vars(FULL), "refine": refine}), query, OneTemplate(template))
+        for refine in (NoRefinement(), Shifted())
+    )
+    before, after = plain.best.solution, shifted.best.solution
+    assert before is not None
+    assert after is not None
+    np.testing.assert_allclose(after.T_cam_obj[:3, 3] - before.T_cam_obj[:3, 3], [3, 0, 0], atol=1e-9)
+    assert np.array_equal(after.inliers, before.inliers)
+    assert before.reprojection_px < 0.01
+    seen = plain.best.points_obj[before.inliers]
+    error = camera.project(query.K, rigid.transform(after.T_cam_obj, seen)) - plain.best.query_px_img[before.inliers]
+    assert after.reprojection_px == pytest.approx(np.sqrt(np.mean(np.square(error).sum(1))))
+    assert "refine" in shifted.times_s

@@ -105,6 +105,14 @@ def summary(name: str) -> list[float]:
     if stage == "solve":
         solution = spec(*toy_points())
         return [float(solution.inliers.sum()), *solution.T_cam_obj[:3].round(4).flatten().tolist()]
+    if stage == "refine":
+        pair = toy_pair()
+        x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
+        bumps = np.random.default_rng(RNG_SEED).uniform(-5, 5, len(x))
+        start = rigid.rigid(np.eye(3), np.array([1.0, -0.6, 404.0]))
+        K_crop = np.array([[-400.0, 0, 31.5], [0, 400.0, 31.5], [0, 0, 1]])  # the query mirrors the template
+        found = spec(start, pair, np.stack([x, y, bumps], axis=1), K_crop, crop_size=64)
+        return [float(np.array_equal(found, start)), *found[:3].round(4).flatten().tolist()]
     if stage == "crop":
         rgb = toy_crops().rgb[0]
         crop, mask, A_crop_img = spec(rgb, disc(128).numpy(), (0.0, 0.0, 127.0, 127.0))

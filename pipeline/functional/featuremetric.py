@@ -2,8 +2,10 @@
 
 A query's map is read in between cells, bilinear, at positions (x, y) in cells. Points that land outside the map,
 outside its mask or behind the camera read nothing. Residuals need inner products alone, and those of a map with itself
-are the same in every step, so that a step costs one product of each point's descriptor with the four cells around it. An increment xi = (v, omega) turns about the points' centre c in the camera
-frame: p -> c + exp(omega) (p - c) + v, a left multiplication of T_cam_obj that does not mix turning with shifting.
+are the same in every step, so that a step costs one product of each point's descriptor with the four cells around it.
+
+An increment xi = (v, omega) turns about the points' centre c in the camera frame: p -> c + exp(omega) (p - c) + v, a
+left multiplication of T_cam_obj that does not mix turning with shifting.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from pipeline.synthetic.objects import make_object
 
 REFINERS = pytest.mark.parametrize("refine", [NoRefinement(), Featuremetric()], ids=["none", "featuremetric"])
 CROP, STUDIO = Square(), Raycast(count=80, size=512)
-EXACT = Featuremetric(scale=0.25)  # hidden cells weigh least with a narrow loss
+EXACT = Featuremetric(loss="barron", scale=0.25, max_points=5000)  # the least pull of cells that the query hides
 K_QUERY = camera.resize_affine(2.0) @ np.array([[572.4, 0.0, 325.3], [0.0, 573.6, 242.0], [0.0, 0.0, 1.0]])
 
 
@@ -151,7 +151,10 @@ def test_a_crop_that_a_homography_cuts_from_a_turned_camera_gives_the_same_pose(
     T_crop_cam = rigid.rigid(cv2.Rodrigues(np.array([0.2, -0.3, 0.1]))[0], np.zeros(3))
     turned = replace(scene, K_crop=scene.K_crop @ T_crop_cam[:3, :3])
     found = turned(refine, rigid.inverse(T_crop_cam) @ start)
-    np.testing.assert_allclose(T_crop_cam @ found, scene(refine, start), atol=1e-5)
+    # damping is by the axes of the camera that is asked, so steps differ and end a hundredth of a millimetre apart
+    angle_deg, length_mm = errors(T_crop_cam @ found, scene(refine, start))
+    assert angle_deg < 0.002
+    assert length_mm < 0.01
 
 
 @pytest.mark.parametrize("loss", ALPHA)

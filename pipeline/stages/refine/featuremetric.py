@@ -44,7 +44,7 @@ class Featuremetric(Spec):
     sigmas_cells: Annotated[tuple[Sigma, ...], Field(min_length=1)] = (2.0, 1.0, 0.0)
     iterations: Positive = 30
     normalise: bool = True
-    max_points: Positive = 2000
+    max_points: Positive = 1000
     seed: NonNegative = 0
 
     def __call__(
