@@ -32,7 +32,9 @@ def sides(
     return by_cluster[:, :, :q], by_cluster[:, :, q:]
 
 
-def correspondence_loss(descriptors: Float[Tensor, "n d h w"], batch: PairBatch, scale: Tensor) -> Float[Tensor, ""]:
+def correspondence_loss(
+    descriptors: Float[Tensor, "n d h w"], batch: PairBatch, scale: Tensor
+) -> Float[Tensor, ""]:
     """Cross entropy of a query cell's cosines over a template's foreground cells (InfoNCE).
 
     The target is spread over the four cells about the true place, as bilinear interpolation would; correspondences
