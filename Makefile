@@ -48,7 +48,7 @@ demo: $(STAMP) ## poses of procedural objects in cluttered scenes, errors agains
 	$(PY) -m pipeline dataset=demo step=report $(ARGS)
 
 ablations: $(STAMP) ## the paper's ablations on the demo data; ARGS="dataset=lmo dataset.root=..." for others
-	$(PY) -m pipeline dataset=demo $(ARGS)
+	$(PY) -m pipeline dataset=demo method=dzop $(ARGS)
 	@$(call sweep,$(PAPER))
 
 sweeps: $(STAMP) ## what the paper did not ablate, on the demo data
