@@ -35,7 +35,7 @@ from pipeline.spec import Runtime, build
 from pipeline.store import Store
 from pipeline.whole import write_whole
 
-STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "detect")
+STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "refine", "detect")
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
@@ -142,6 +142,8 @@ def _job(config: DictConfig, *, sweeping: bool) -> None:
 def stages_of(values: Mapping[str, Any]) -> Stages:
     """The stages a configuration chooses."""
     chosen = {name: variant(values[name], name) for name in STAGES}
+    if hasattr(chosen["fuse"], "resolve_for"):
+        chosen["fuse"] = chosen["fuse"].resolve_for(chosen["extract"].model)
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
     return Stages(**chosen, fallback=values["fallback"])
@@ -162,14 +164,11 @@ def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:
 
 
 def variant(values: Mapping[str, Any], where: str) -> Any:
-    """The spec that ``_target_`` names, with its fields checked, some of which may be variants themselves.
+    """The spec that ``_target_`` names, with its fields checked; ``auto`` variants answer with a concrete one.
 
-    ``auto`` variants answer with a concrete one.
+    A field whose value has a ``_target_`` of its own is built first, to any depth: a variant made of variants.
     """
-    fields = {
-        name: variant(value, f"{where}.{name}") if isinstance(value, Mapping) and "_target_" in value else value
-        for name, value in values.items()
-    }
+    fields = {name: _nested(value, f"{where}.{name}") for name, value in values.items()}
     target = fields.pop("_target_", None)
     if not isinstance(target, str):
         raise BadInput(f"{where}._target_", found=repr(target), needed="the import path of a class")
@@ -181,6 +180,10 @@ def variant(values: Mapping[str, Any], where: str) -> Any:
         ) from None
     chosen: Any = build(cls, fields, where=where)
     return chosen.resolve() if hasattr(chosen, "resolve") else chosen
+
+
+def _nested(value: Any, where: str) -> Any:
+    return variant(value, where) if isinstance(value, Mapping) and "_target_" in value else value
 
 
 def _told(error: BaseException) -> str:

@@ -267,4 +267,6 @@ def _template_metrics(judged: Judged, instances: int) -> dict[str, float | None]
         angles = np.array([getattr(error, reading) for error in judged.templates.values()])
         told[f"Acc{ACC_DEG:.0f}_{reading}"] = float((angles < ACC_DEG).sum() / max(instances, 1))
         told[f"template_error_{reading}_deg"] = float(angles.mean()) if len(angles) else None
+    if judged.correspondences:
+        told["correspondence_error_percent"] = 100 * float(np.median(list(judged.correspondences.values())))
     return told

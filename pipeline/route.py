@@ -1,8 +1,8 @@
 """The method on one page: a detection's features and its object's templates -> a pose, or the reason why there is none.
 
-mesh -render-> templates -crop, extract-> template features            (offline, once for every object)
+mesh -render-> templates -crop, extract-> template features -fit->     (offline, once for every object)
 image -detect, crop, extract-> query features                          (once for every image)
-query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> pose
+query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve, refine-> pose
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,18 +20,22 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional import camera, rigid
+from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
-from pipeline.items.features import Clusters, FusedPair
+from pipeline.functional.pnp import reprojection_error_px
+from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
 from pipeline.stages.cluster import Clusterer
-from pipeline.stages.correspond import Corresponder, TruthCorresponder
+from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import DescribingDetector, Detector
 from pipeline.stages.extract import Extractor
-from pipeline.stages.fuse import Fuser
+from pipeline.stages.fit import Fit, Fitted, chain
+from pipeline.stages.fuse import FittedFuser, Fuser
 from pipeline.stages.lift import lift
-from pipeline.stages.match import Matcher, TruthMatcher
+from pipeline.stages.match import FittedMatcher, Matcher, TruthMatcher
+from pipeline.stages.refine import Refiner
 from pipeline.stages.render import Renderer
 from pipeline.stages.solve import Solver
 
@@ -50,6 +54,7 @@ class Stages:
     cluster: Clusterer
     correspond: Corresponder
     solve: Solver
+    refine: Refiner
     detect: Detector | DescribingDetector
     fallback: bool = False
 
@@ -62,8 +67,15 @@ class Stages:
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Decoder layers the route reads: the template layer and the hyperfeature layers."""
-        return tuple(sorted({self.match.layer, *self.fuse.layers}))
+        """Layers the route reads: the template layer, the hyperfeature layers, saliency where it is needed."""
+        salient = {SALIENCY_LAYER} if isinstance(self.correspond, SalientCorresponder) else set()
+        return tuple(sorted({self.match.layer, *self.fuse.layers} | salient))
+
+    @property
+    def fits(self) -> tuple[Fit, ...]:
+        """What is fitted to an object's templates, each once, and before it what it stands on."""
+        found = [s.fit for s in (self.match, self.fuse) if isinstance(s, (FittedMatcher, FittedFuser))]
+        return tuple(dict.fromkeys(part for fit in found for part in chain(fit)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +112,15 @@ class TemplateView:
 class TemplateBank(Protocol):
     """An object's templates: features of the match layer, crop masks and poses of all of them, any view in full."""
 
-    features: Float[Tensor, "n c h w"]
-    mask: Bool[Tensor, "n S S"]
+    @property
+    def features(self) -> Float[Tensor, "n c h w"]:
+        """Features of the match layer."""
+        ...
+
+    @property
+    def mask(self) -> Bool[Tensor, "n S S"]:
+        """Masks of the crops."""
+        ...
 
     @property
     def T_cam_obj(self) -> Float[np.ndarray, "n 4 4"]:
@@ -110,6 +129,10 @@ class TemplateBank(Protocol):
 
     def view(self, index: int) -> TemplateView:
         """Everything about one template."""
+        ...
+
+    def fitted(self, fit: Fit) -> Fitted:
+        """What was fitted to the templates."""
         ...
 
 
@@ -177,13 +200,17 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
     hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
     hypotheses.sort(key=lambda h: -h.inliers)  # stable: equals stay in the order of their templates
+    hypotheses[0] = _refined(stages, query, bank, hypotheses[0], clock)
     return Trace(match, tuple(hypotheses), clock.times_s)
 
 
 def _match(stages: Stages, query: Query, bank: TemplateBank) -> TemplateMatch:
     if isinstance(stages.match, TruthMatcher) and query.truth is not None:
         return stages.match.by_truth(query.truth.T_cam_obj, query.truth.symmetries, bank.T_cam_obj)
-    return stages.match(query.features[stages.match.layer], query.mask, bank.features, bank.mask)
+    features = query.features[stages.match.layer]
+    if isinstance(stages.match, FittedMatcher):
+        return stages.match.by_fitted(features, query.mask, bank.fitted(stages.match.fit))
+    return stages.match(features, query.mask, bank.features, bank.mask)
 
 
 def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, score: float, clock: Clock) -> Hypothesis:
@@ -192,7 +219,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
         with clock("read template"):
             template = bank.view(index)
         with clock("fuse"):
-            pair = stages.fuse(query.features, template.features, query.mask, template.mask)
+            pair = _with_saliency(_fused(stages, query, template, bank), query, template)
             parts["pair"] = pair
         with clock("cluster"):
             clusters = stages.cluster(pair)
@@ -207,13 +234,26 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
             seen = np.isfinite(points_obj).all(1)
             if seen.sum() < MIN_POINTS:
                 raise NoPose("lift", f"{seen.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
-            solution = stages.solve(points_obj[seen], query_px_img[seen], query.K)
-            inliers = np.zeros(len(seen), bool)
-            inliers[seen] = solution.inliers
-            parts["solution"] = PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
+            parts["solution"] = _solved(stages, query, points_obj, query_px_img, seen)
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
+
+
+def _fused(stages: Stages, query: Query, template: TemplateView, bank: TemplateBank) -> FusedPair:
+    sides = query.features, template.features, query.mask, template.mask
+    if isinstance(stages.fuse, FittedFuser):
+        return stages.fuse.by_fitted(*sides, bank.fitted(stages.fuse.fit))
+    return stages.fuse(*sides)
+
+
+def _with_saliency(pair: FusedPair, query: Query, template: TemplateView) -> FusedPair:
+    """The pair with the saliency of its cells, where the extractor was asked for it."""
+    if SALIENCY_LAYER not in query.features:
+        return pair
+    cells = pair.query.shape[-1]
+    seen = [upsample(side.features[SALIENCY_LAYER].float(), cells=cells)[0] for side in (query, template)]
+    return replace(pair, query_saliency=seen[0], template_saliency=seen[1])
 
 
 def _matched(
@@ -222,14 +262,41 @@ def _matched(
     """Corresponding points; the true ones for an oracle."""
     if not isinstance(stages.correspond, TruthCorresponder) or query.truth is None:
         return stages.correspond(pair, clusters, crop_size=stages.crop.size)
+    template_px, points_obj = _template_cells(stages, template, pair)
+    true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
+    true_px = torch.from_numpy(camera.apply(query.A_crop_img, true_px_img)).to(template_px.device)
+    return stages.correspond.by_truth(template_px, true_px, query.mask)
+
+
+def _template_cells(
+    stages: Stages, template: TemplateView, pair: FusedPair
+) -> tuple[Float[Tensor, "m 2"], Float[np.ndarray, "m 3"]]:
+    """Crop pixels and object points (mm, NaN off the object) of the centres of the template's foreground cells."""
     cells = pair.template_mask.shape[-1]
     cell_xy = camera.grid_xy(foreground(pair.template_mask), width=cells)
     template_px = camera.cell_to_px(cell_xy.double(), size=stages.crop.size, cells=cells)
     px = template_px.cpu().numpy()
-    points_obj = lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
-    true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
-    true_px = torch.from_numpy(camera.apply(query.A_crop_img, true_px_img)).to(template_px.device)
-    return stages.correspond.by_truth(template_px, true_px, query.mask)
+    return template_px, lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
+
+
+def _refined(stages: Stages, query: Query, bank: TemplateBank, best: Hypothesis, clock: Clock) -> Hypothesis:
+    """The hypothesis with its pose refined; its inliers stay the solver's, its reprojection is that of the new pose.
+
+    Inliers say how many correspondences agree on a pose, which is what scores go by; a refinement by other means than
+    correspondences has no say in that.
+    """
+    if best.solution is None or best.pair is None or best.points_obj is None or best.query_px_img is None:
+        return best
+    with clock("refine"):
+        _, points_obj = _template_cells(stages, bank.view(best.template_id), best.pair)
+        K_crop = query.A_crop_img @ query.K
+        T_cam_obj = stages.refine(best.solution.T_cam_obj, best.pair, points_obj, K_crop, crop_size=stages.crop.size)
+    if np.array_equal(T_cam_obj, best.solution.T_cam_obj):
+        return best
+    rows = best.solution.inliers
+    error = reprojection_error_px(best.points_obj[rows], best.query_px_img[rows], query.K, T_cam_obj)
+    root_mean_square = float(np.sqrt(np.mean(error**2)))
+    return replace(best, solution=PoseSolution(T_cam_obj, rows, root_mean_square))
 
 
 def _lifted(
@@ -242,21 +309,43 @@ def _lifted(
     return points_obj, camera.apply(np.linalg.inv(query.A_crop_img), query_px)
 
 
+def _solved(
+    stages: Stages,
+    query: Query,
+    points_obj: Float[np.ndarray, "m 3"],
+    query_px_img: Float[np.ndarray, "m 2"],
+    seen: Bool[np.ndarray, " m"],
+) -> PoseSolution:
+    """The pose of the points seen, solved in the plane that the solver asks for; errors are in the query image."""
+    points, px_img, inliers = points_obj[seen], query_px_img[seen], np.zeros(len(seen), bool)
+    if stages.solve.plane == "image":
+        solution = stages.solve(points, px_img, query.K)
+        inliers[seen] = solution.inliers
+        return PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
+    K_crop, R_crop_cam = camera.crop_camera(query.A_crop_img, query.K)
+    solution = stages.solve(points, camera.apply(query.A_crop_img, px_img), K_crop)
+    inliers[seen] = solution.inliers
+    T_cam_obj = rigid.rigid(R_crop_cam.T, np.zeros(3)) @ solution.T_cam_obj
+    error_px = reprojection_error_px(points_obj[inliers], query_px_img[inliers], query.K, T_cam_obj)
+    return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px**2))))
+
+
 def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:
     """T_cam_obj from a template alone: its rotation, and the translation that fits place and size of the crop.
 
-    The object's origin keeps its place in the crop; depth scales with focal length times crop magnification; the
-    rotation is turned with the viewing ray, so that the object looks the same from its new place in the image.
+    In the cameras whose pictures the two crops are (camera.crop_camera): the object's origin keeps its place in the
+    crop; depth scales with the focal length; the rotation is turned with the viewing ray, so that the object looks the
+    same from its new place.
     """
-    t = template.T_cam_obj[:3, 3]
-    origin_crop = camera.apply(template.A_crop_img, camera.project(template.K, t))
-    origin_img = camera.apply(np.linalg.inv(query.A_crop_img), origin_crop)
-    zoom_template = template.A_crop_img[0, 0] * template.K[0, 0]
-    zoom_query = query.A_crop_img[0, 0] * query.K[0, 0]
-    depth = t[2] * zoom_query / zoom_template
-    position = camera.unproject(query.K, origin_img[None], np.array([depth]))[0]
+    K_query, R_query_cam = camera.crop_camera(query.A_crop_img, query.K)
+    K_template, R_template_cam = camera.crop_camera(template.A_crop_img, template.K)
+    T_template_obj = rigid.rigid(R_template_cam, np.zeros(3)) @ template.T_cam_obj
+    t = T_template_obj[:3, 3]
+    origin_crop = camera.project(K_template, t)
+    depth = t[2] * K_query[0, 0] / K_template[0, 0]
+    position = camera.unproject(K_query, origin_crop[None], np.array([depth]))[0]
     turn = rigid.rotation_between(t, position)
-    return rigid.rigid(turn @ template.T_cam_obj[:3, :3], position)
+    return rigid.rigid(R_query_cam.T, np.zeros(3)) @ rigid.rigid(turn @ T_template_obj[:3, :3], position)
 
 
 def to_device(features: Mapping[int, np.ndarray], device: str) -> dict[int, Tensor]:

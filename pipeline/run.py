@@ -69,13 +69,14 @@ class Evaluate:
     """How poses are scored. ``models``: folder of the meshes errors are measured on, the dataset's where it is missing.
 
     ``vsd_delta_mm``: how much deeper than the depth image a surface may lie and still count as visible (BOP: 15).
-    ``theta_max``: thresholds above it are left out of the averages.
+    ``theta_max``: thresholds above it are left out of the averages. ``correspondences``: judge them as well.
     """
 
     vsd: bool = True
     vsd_delta_mm: PositiveFloat = 15.0
     models: str = "models_eval"
     theta_max: Annotated[float, Field(ge=0.05, le=0.5)] = 0.5
+    correspondences: bool = False
 
 
 @spec
@@ -198,7 +199,7 @@ def _scores(graph: Graph, options: Options) -> ScoreNodes | None:
         )
     models = chosen.models if there else data.models
     scorer = Scorer(data, graph.run.targets, models, vsd_delta_mm=chosen.vsd_delta_mm, with_vsd=chosen.vsd)
-    return graph.scores(scorer)
+    return graph.scores(scorer, correspondences=chosen.correspondences)
 
 
 def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float) -> None:

@@ -12,6 +12,7 @@ STEPS = (
     "templates",
     "template crops",
     "template features",
+    "fits",
     "proposals",
     "proposal features",
     "detections",

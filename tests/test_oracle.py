@@ -16,12 +16,17 @@ from pipeline.spec import Runtime
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
+from pipeline.stages.correspond.cyclic import Cyclic
 from pipeline.stages.crop.square import Square
+from pipeline.stages.crop.virtual import Virtual
 from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.pca import Pca
+from pipeline.stages.fuse.template_pca import TemplatePca
 from pipeline.stages.match.cosine import Cosine
+from pipeline.stages.match.words import Words
+from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
@@ -37,6 +42,7 @@ FULL = Stages(
     cluster=KMeans(),
     correspond=Corresponder(),
     solve=Epnp(),
+    refine=NoRefinement(),
     detect=GtMask(),
 )
 ABLATIONS = {
@@ -44,6 +50,14 @@ ABLATIONS = {
     "clusters off": {"cluster": One()},
     "sub-pixel off": {"correspond": Corresponder(kernel=1)},
     "co-projection off": {"fuse": Concat()},
+    "FoundPose's stages": {
+        "crop": Virtual(padding_ratio=1.7),
+        "match": Words(count=256),
+        "fuse": TemplatePca(dim=64),
+        "cluster": One(),
+        "correspond": Cyclic(),
+        "solve": Epnp(plane="crop", threshold_px=10.0),
+    },
 }
 
 
@@ -86,7 +100,7 @@ def test_poses_from_true_coordinates_are_exact_to_a_degree_and_a_hundredth_of_th
     assert translation < 0.01
 
 
-def magnified_query(factor: int) -> tuple[Query, TemplateView]:
+def magnified_query(factor: int, crop_stage: Square | Virtual = FULL.crop) -> tuple[Query, TemplateView]:
     """A template, and as query the same picture with every pixel made a block of ``factor`` x ``factor``."""
     mesh = make_object(5)
     K, T_cam_obj, size_hw = FULL.render.cameras(mesh)
@@ -96,7 +110,7 @@ def magnified_query(factor: int) -> tuple[Query, TemplateView]:
         K_view = camera.resize_affine(float(times)) @ K
         picture, depth = (np.repeat(np.repeat(image[0], times, 0), times, 1) for image in (rgb, depth_mm))
         whole = (-0.5, -0.5, depth.shape[1] - 0.5, depth.shape[0] - 0.5)
-        crop, mask, A_crop_img = FULL.crop(picture, depth > 0, whole)
+        crop, mask, A_crop_img = crop_stage(picture, depth > 0, whole, K_view)
         crops = Crops(crop[None], mask[None], A_crop_img[None], Geometry([depth], K_view[None], T_cam_obj[:1]))
         maps = {layer: m[0] for layer, m in backbone(crops, FULL.layers).items()}
         views.append((maps, torch.from_numpy(mask), A_crop_img, K_view))
@@ -113,10 +127,15 @@ class OneTemplate:
         return self._view
 
 
+@pytest.mark.parametrize("plane", ["image", "crop"])
+@pytest.mark.parametrize("crop", [Square(), Virtual()], ids=["square", "virtual"])
 @pytest.mark.parametrize("subpixel", [1, 3])
-def test_a_query_magnified_by_three_against_its_own_template_comes_back_within_a_hundredth_of_a_pixel(subpixel: int):
-    query, template = magnified_query(3)
-    stages = Stages(**{**vars(FULL), "correspond": Corresponder(kernel=subpixel)})
+def test_a_query_magnified_by_three_against_its_own_template_comes_back_within_a_hundredth_of_a_pixel(
+    subpixel: int, crop: Square | Virtual, plane: str
+):
+    query, template = magnified_query(3, crop)
+    changes = {"crop": crop, "correspond": Corresponder(kernel=subpixel), "solve": Epnp(plane=plane)}
+    stages = Stages(**{**vars(FULL), **changes})
     best = trace_pose(stages, query, OneTemplate(template)).best
     assert best.solution is not None
     points = best.points_obj[np.isfinite(best.points_obj).all(1)]

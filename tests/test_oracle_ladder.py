@@ -24,6 +24,7 @@ from pipeline.stages.extract.hog import Hog
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.oracle import Oracle
+from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
@@ -38,6 +39,7 @@ PLAIN = Stages(
     cluster=One(),
     correspond=Corresponder(),
     solve=Epnp(),
+    refine=NoRefinement(),
     detect=GtMask(),
 )
 ORACLES = {"match": {"match": Oracle()}, "correspond": {"correspond": CorrespondOracle()}}

@@ -17,7 +17,6 @@ from torch import Tensor
 from pipeline.embedded.pictures import Picture, View, photograph, template
 from pipeline.embedded.views import (
     CLUSTERS_PER_OBJECT,
-    OBJECTS_PER_SHARD,
     SIZE,
     VIEWS,
     Views,
@@ -51,7 +50,7 @@ class Source:
         found = []
         for _ in range(count):
             views = _shard(self.folder, int(rng.integers(known)), self.validation)
-            first = CLUSTERS_PER_OBJECT * int(rng.integers(OBJECTS_PER_SHARD))
+            first = CLUSTERS_PER_OBJECT * int(rng.integers(len(views) // CLUSTERS_PER_OBJECT))
             clusters = range(first, first + CLUSTERS_PER_OBJECT)
             found.append([[_unpacked(views, k, v) for v in range(VIEWS)] for k in clusters])
         return found, rng

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+
+import numpy as np
+
+from pipeline.items.scores import Scores
+from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
+from pipeline.metrics.recall import instance_recalls
+from pipeline.report.rows import Row, read_rows
 
 TEST_SEED = 9041  # of synthetic.demo; training and validation objects have builders and seeds of their own
 DEMO = ("dataset=demo", f"dataset.seed={TEST_SEED}", "dataset.objects=20", "dataset.images=40", "dataset.per_image=5")
+OURS = "embedded, learned"
 SYSTEMS = {
-    "embedded, learned": ("method=dzop_learned",),
-    "embedded, pure": ("method=dzop_masked", "extract=embedded", "extract.weights=pure"),
-    "random weights": ("method=dzop_masked", "extract=random_sd", "extract.noise=none"),
-    "pixels": ("method=dzop_masked", "extract=pixels"),
-    "HOG": ("method=dzop_masked", "extract=hog"),
+    OURS: ("extract=embedded",),
+    "embedded, pure": ("extract=embedded", "extract.weights=pure"),
+    "random weights": ("extract=random_sd", "extract.noise=none"),
+    "pixels": ("extract=pixels",),
+    "HOG": ("extract=hog",),
 }
-COLUMNS = ("Acc15_geodesic", "template_error_geodesic_deg", "AR", "AR_MSSD", "AR_MSPD")
-QUIET = ("gallery=0", "overlays=false")
+TEMPLATES = {
+    "Acc15_geodesic": "Acc15",
+    "template_error_geodesic_deg": "template error, deg",
+    "correspondence_error_percent": "correspondence error, % of diameter",
+}
+RECALLS = ("AR_VSD", "AR_MSSD", "AR_MSPD")  # in the order of metrics.recall.instance_recalls
+QUIET = ("gallery=0", "overlays=false", "evaluate.correspondences=true")
 
 
 def benchmark(folder: Path, *, lmo: Path | None = None, detections: Path | None = None) -> str:
@@ -34,21 +45,44 @@ def benchmark(folder: Path, *, lmo: Path | None = None, detections: Path | None 
 
 
 def _table(title: str, data: Sequence[str], folder: Path) -> str:
-    lines = [f"**{title}**", "", f"| features | {' | '.join(COLUMNS)} |", "|---" * (len(COLUMNS) + 1) + "|"]
+    """A row for each system: 95 % intervals over images in brackets, and by how much the first one leads."""
+    rows = {}
     for name, choices in SYSTEMS.items():
         out = folder / "results" / title.replace(",", "").replace(" ", "_") / name.replace(",", "").replace(" ", "_")
-        metrics = _run([*data, *choices, *QUIET], out, folder / "cache")
-        lines.append(f"| {name} | {' | '.join(_shown(metrics.get(column)) for column in COLUMNS)} |")
+        rows[name] = _run(["method=dzop_x", *data, *choices, *QUIET], out, folder / "cache")
+    recalls = [k for k, name in enumerate(RECALLS) if rows[OURS].metrics.get(name) is not None]
+    heads = ["features", *TEMPLATES.values(), *(RECALLS[k] for k in recalls), "mean", f"lead of {OURS}"]
+    lines = [f"**{title}**", "", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for name, row in rows.items():
+        values = _recalls(row, recalls)
+        shown = [_shown(row.metrics.get(column)) for column in TEMPLATES]
+        shown += [_bracketed(v, row) for v in (*values.T, values.mean(axis=1))]
+        lead = "" if name == OURS else _bracketed((_recalls(rows[OURS], recalls) - values).mean(axis=1), row)
+        lines.append(f"| {name} | {' | '.join([*shown, lead])} |")
     return "\n".join(lines)
 
 
-def _run(choices: Sequence[str], out: Path, cache: Path) -> dict[str, Any]:
-    """The metrics of a run of the pipeline, as its row holds them."""
+def _run(choices: Sequence[str], out: Path, cache: Path) -> Row:
+    """The row of a run of the pipeline."""
     where = [f"out={out}", f"store.root={cache}"]
     subprocess.run([sys.executable, "-m", "pipeline", *choices, *where], check=True, stdout=subprocess.DEVNULL)
-    newest = max((out / "rows").glob("*.json"), key=lambda path: path.stat().st_mtime)
-    return dict(json.loads(newest.read_text())["metrics"])
+    return max(read_rows(out), key=lambda row: row.at)
+
+
+def _recalls(row: Row, which: Sequence[int]) -> np.ndarray:
+    return instance_recalls(_scores(row))[:, which]
+
+
+def _scores(row: Row) -> Scores:
+    assert row.scores is not None
+    return row.scores
+
+
+def _bracketed(values: np.ndarray, row: Row) -> str:
+    scores = _scores(row)
+    found: Interval = mean_interval(values, image_index(scores.scene_id, scores.im_id))
+    return f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]"
 
 
 def _shown(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}" if value < 2 else f"{value:.1f}"
+    return "-" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}"

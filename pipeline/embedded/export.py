@@ -32,15 +32,23 @@ def export(place: Place, folder: Path) -> int:
     if described is not None:
         made["unet_learned.safetensors"] = _half(_below("unet.", described["average"]))
         made["head.safetensors"] = _half(_below("head.", described["average"]))
-    saved = {"autoencoder": autoencoder, "denoiser": denoiser, "descriptors": described}
-    steps = {stage: state["step"] for stage, state in saved.items() if state is not None}
-    made["steps.json"] = (json.dumps(steps, indent=1) + "\n").encode()
+    curves = {stage: _curve(place, stage) for stage in ("autoencoder", "denoiser", "descriptors")}
+    made["losses.json"] = (json.dumps(curves) + "\n").encode()
     size = sum(map(len, made.values()))
     if size > MOST_BYTES:
         raise ValueError(f"{size} bytes of weights, at most {MOST_BYTES} may ship")
     for name, content in made.items():
         write_whole(folder / name, content)
     return size
+
+
+def _curve(place: Place, stage: str) -> list[dict[str, float]]:
+    """Losses of the first steps, of every 25th and of the last: a repeated training can be held against them."""
+    path = place.curve(stage)
+    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    kept = [record for record in records if record["step"] < 20 or record["step"] % 25 == 0] + records[-1:]
+    by_step = {record["step"]: record for record in kept}  # steps after a checkpoint that was gone back to come twice
+    return [{name: value for name, value in record.items() if name != "time_s"} for record in by_step.values()]
 
 
 def _saved(place: Place, stage: str) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from pipeline.embedded.batches import CELLS, PairBatch
 from pipeline.functional.masks import cell_mask
 
 _NEAR_DEG = 12.0  # templates about this far off are half as good as the query's own view
+_MATCHED_DEG = 20.0  # poses are solved from templates about this near: others teach little
 
 
 def reconstruction_loss(
@@ -36,7 +37,7 @@ def correspondence_loss(descriptors: Float[Tensor, "n d h w"], batch: PairBatch,
     """Cross entropy of a query cell's cosines over a template's foreground cells (InfoNCE).
 
     The target is spread over the four cells about the true place, as bilinear interpolation would; correspondences
-    with less than half of that in the foreground do not count.
+    with less than half of that in the foreground do not count, and those with distant templates count little.
     """
     query, template = (maps.flatten(0, 1) for maps in sides(normalize(descriptors.float(), dim=1), batch))
     xy = batch.query_xy.flatten(0, 1)
@@ -52,7 +53,15 @@ def correspondence_loss(descriptors: Float[Tensor, "n d h w"], batch: PairBatch,
     total = weight.sum(-1)
     usable = batch.matched.flatten(0, 1).transpose(1, 2).reshape(g * t, q * m) & (total > 0.5)
     hit = (weight * logits.gather(2, place)).sum(-1) / total.clamp(min=0.5)
-    return ((logits.logsumexp(-1) - hit) * usable).sum() / usable.sum().clamp(min=1)
+    counted = usable * _nearness(batch).reshape(g * t, q, 1).expand(-1, -1, m).reshape(g * t, q * m)
+    return ((logits.logsumexp(-1) - hit) * counted).sum() / counted.sum().clamp(min=1)
+
+
+def _nearness(batch: PairBatch) -> Float[Tensor, "g t q"]:
+    """Weight of each query with each template of its own cluster."""
+    by_cluster = batch.angle_deg.unflatten(3, (-1, batch.matched.shape[3]))  # b c q c t
+    own = by_cluster.diagonal(dim1=1, dim2=3).permute(0, 3, 2, 1).flatten(0, 1)  # b q t c -> g t q
+    return torch.exp(-0.5 * (own / _MATCHED_DEG) ** 2)
 
 
 def _index(xy: Float[Tensor, "*n 2"]) -> Int64[Tensor, "*n"]:

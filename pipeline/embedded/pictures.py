@@ -54,15 +54,19 @@ def template(view: View, rng: Rng) -> Picture:
 
 
 def photograph(view: View, rng: Rng) -> Picture:
-    """Another light, camera and crop; hidden in part, small, blurred, noisy, its mask not quite right."""
+    """Another light, camera and crop; hidden in part, small, blurred, noisy, its mask not quite right.
+
+    How bad it is varies from nearly perfect to hardly legible: what can be placed exactly has to be placed exactly.
+    """
+    rough = float(rng.uniform())
     colour, ground = _relit(view, rng), _ground(rng)
-    seen = _hidden(view.mask, rng) if rng.uniform() < 0.6 else view.mask
+    seen = _hidden(view.mask, rng) if rng.uniform() < 0.5 else view.mask
     colour = np.where(seen[..., None], colour, ground)
-    mask = _wrong_mask(seen, rng) if rng.uniform() < 0.6 else seen
+    mask = _wrong_mask(seen, rng) if rng.uniform() < rough else seen
     box = mask_bbox(mask)
     assert box is not None
     A_crop_view = square_crop(box, size=SIZE, padding_ratio=1.2)
-    rgb, cropped = _taken(colour, mask, A_crop_view, rng)
+    rgb, cropped = _taken(colour, mask, A_crop_view, rough, rng)
     return Picture(rgb, cropped, seen & mask, A_crop_view)
 
 
@@ -141,22 +145,26 @@ def _wrong_mask(seen: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S 
 
 
 def _taken(
-    colour: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"], A_crop_view: Float[np.ndarray, "3 3"], rng: Rng
+    colour: Float32[np.ndarray, "S S 3"],
+    mask: Bool[np.ndarray, "S S"],
+    A_crop_view: Float[np.ndarray, "3 3"],
+    rough: float,
+    rng: Rng,
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"]]:
     """The crop of a camera that gives it few pixels: shrunk, blurred, noisy, compressed, masked and enlarged again."""
-    side = int(np.exp(rng.uniform(np.log(28), np.log(SIZE))))
+    side = int(SIZE * (28 / SIZE) ** (rough * rng.uniform()))
     A = np.array([[side / SIZE, 0, 0.5 * side / SIZE - 0.5], [0, side / SIZE, 0.5 * side / SIZE - 0.5], [0, 0, 1]])
     A = A @ A_crop_view
-    soft = 0.4 * max(1 / A[0, 0] - 1, 0) + rng.choice([0.0, rng.uniform(0, 0.8)]) / A[0, 0]
+    soft = 0.4 * max(1 / A[0, 0] - 1, 0) + rng.choice([0.0, rough * rng.uniform(0, 1.0)]) / A[0, 0]
     if soft > 0.2:
         colour = cv2.GaussianBlur(colour, (0, 0), soft)
     small = cv2.warpAffine(colour, A[:2], (side, side), flags=cv2.INTER_LINEAR)
     inside = cv2.warpAffine(mask.astype(np.float32), A[:2], (side, side), flags=cv2.INTER_LINEAR) >= 0.5
     if rng.uniform() < 0.3:
         small = small + rng.uniform(0, 1.2) * (small - cv2.GaussianBlur(small, (0, 0), 1.0))
-    noise = rng.normal(size=small.shape) * rng.choice([1.0, rng.uniform(1, 9)])
+    noise = rng.normal(size=small.shape) * rng.uniform(0.5, 1 + 9 * rough)
     small = np.clip(small + noise, 0, 255).astype(np.uint8)
-    if rng.uniform() < 0.4:
+    if rng.uniform() < 0.6 * rough:
         _, code = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))])
         small = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
     large = cv2.resize((small * inside[..., None]).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_LINEAR)

@@ -160,7 +160,7 @@ class Denoiser(Stage):
 class Descriptors(Stage):
     """The denoiser and an aggregation of its maps, together, on correspondences and retrieval."""
 
-    name, rate = "descriptors", 1e-3
+    name, rate = "descriptors", 1.5e-3
 
     def build(self, place: Place) -> Any:
         """On from the denoiser's average."""

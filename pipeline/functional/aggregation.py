@@ -26,7 +26,7 @@ class Aggregation(nn.Module):
         self.widen, self.narrow = nn.Conv2d(dim, 2 * dim, 1), nn.Conv2d(2 * dim, dim, 1)
         self.split = nn.Conv2d(dim, 4 * dim, 3, padding=1)
 
-    def forward(self, maps: Mapping[int, Float[Tensor, "n _c _h _w"]]) -> Float[Tensor, "n d 2*h 2*w"]:
+    def forward(self, maps: Mapping[int, Float[Tensor, "n _c _h _w"]]) -> Float[Tensor, "n d H W"]:
         """Descriptors at twice the resolution of the finest layer; their lengths mean nothing."""
         cells = max(maps[layer].shape[-1] for layer in self.layers)
         total = self._mixed(maps, self.layers, cells)

@@ -7,8 +7,11 @@ Pixel i covers [i - 0.5, i + 0.5]. A map of h x w equal cells over a crop of S p
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from pipeline.functional.rigid import rotation_between
 
 
 def project(K: Float[np.ndarray, "3 3"], points_cam: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 2"]:
@@ -26,8 +29,8 @@ def unproject(
 
 
 def apply(A: Float[np.ndarray, "3 3"], px: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
-    """Pixels moved by an affine map between planes, e.g. A_crop_img."""
-    return px @ A[:2, :2].T + A[:2, 2]
+    """Pixels moved by a homography between planes, e.g. A_crop_img; exactly affine where A's last row is (0, 0, 1)."""
+    return (px @ A[:2, :2].T + A[:2, 2]) / (px @ A[2:, :2].T + A[2:, 2])
 
 
 def resize_affine(factor: float) -> Float[np.ndarray, "3 3"]:
@@ -48,12 +51,63 @@ def square_crop(
     return np.array([[scale, 0.0, -left * scale - 0.5], [0.0, scale, -top * scale - 0.5], [0.0, 0.0, 1.0]])
 
 
+def virtual_crop(
+    bbox_xyxy: tuple[float, float, float, float], K: Float[np.ndarray, "3 3"], *, size: int, padding_ratio: float
+) -> Float[np.ndarray, "3 3"]:
+    """A_crop_img = K_virtual R K^-1 of the camera turned, by the smallest rotation R, towards a box's centre.
+
+    The focal length, the same in x and y, lets the square around the box whose side is ``padding_ratio`` times its
+    longer side just fit: its outermost corner lies on the crop's edge. The crop is no shear of the image: it is what a
+    camera at the same place would take that looks at the object.
+    Raises ValueError for a box that reaches a right angle away from its centre.
+    """
+    x0, y0, x1, y1 = bbox_xyxy
+    half = max(x1 - x0, y1 - y0) * padding_ratio / 2
+    centre = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+    corners = centre + half * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    rays = unproject(K, np.concatenate([centre[None], corners]), np.ones(5))
+    R_virtual_cam = rotation_between(rays[0], np.array([0.0, 0.0, 1.0]))
+    seen = rays[1:] @ R_virtual_cam.T
+    if seen[:, 2].min() <= 0:
+        raise ValueError("the box reaches a right angle away from its centre")
+    focal = size / 2 / np.abs(seen[:, :2] / seen[:, 2:]).max()
+    middle = (size - 1) / 2
+    K_virtual = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
+    return K_virtual @ R_virtual_cam @ np.linalg.inv(K)
+
+
+def crop_camera(
+    A_crop_img: Float[np.ndarray, "3 3"], K: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """K_crop and R_crop_cam of the camera whose picture a crop is: A_crop_img K = K_crop R_crop_cam up to scale.
+
+    RQ decomposition (Hartley and Zisserman, "Multiple View Geometry", 2004, section 6.2.4), focal lengths positive. A
+    crop that only scales and shifts has R = I. Points p_crop = R_crop_cam @ p_cam project with K_crop to crop pixels.
+    """
+    P = A_crop_img @ K
+    K_crop, R_crop_cam = scipy.linalg.rq(P * np.sign(np.linalg.det(P)))
+    sign = np.sign(np.diag(K_crop))
+    K_crop, R_crop_cam = K_crop * sign, sign[:, None] * R_crop_cam
+    return K_crop / K_crop[2, 2], R_crop_cam
+
+
+def local_zoom(A: Float[np.ndarray, "3 3"], px: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m"]:
+    """Magnification of a homography at pixels: the square root of how much it enlarges a small area there."""
+    w = px @ A[2, :2] + A[2, 2]
+    return np.asarray(np.sqrt(np.abs(np.linalg.det(A) / w**3)))
+
+
 def mask_bbox(mask: Bool[np.ndarray, "H W"]) -> tuple[float, float, float, float] | None:
     """Edges (x0, y0, x1, y1) of a mask's pixels, None for an empty mask."""
     ys, xs = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(ys):
         return None
     return float(xs[0]) - 0.5, float(ys[0]) - 0.5, float(xs[-1]) + 0.5, float(ys[-1]) + 0.5
+
+
+def cell_affine(*, size: int, cells: int) -> Float[np.ndarray, "3 3"]:
+    """A_cell_crop: crop pixels to positions (column, row) on a map of ``cells`` cells a side; undoes cell_to_px."""
+    return resize_affine(cells / size)
 
 
 def cell_to_px(cell_xy: Float[Tensor, "m 2"], *, size: int, cells: int) -> Float[Tensor, "m 2"]:

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float32, Int
 from torch import Tensor
 
+_BLOCK = 1 << 14  # points compared with all centres at a time: a whole pair of maps, or a part of an object's templates
+
 
 def kmeans(
     points: Float32[Tensor, "m c"], *, count: int, seed: int, iterations: int
@@ -54,7 +56,8 @@ def spread_start(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -
 
 
 def _nearest_centre(x: Tensor, centre: Tensor) -> Tensor:
-    return torch.addmm((centre * centre).sum(1), x, centre.T, alpha=-2).argmin(1)
+    squared = (centre * centre).sum(1)
+    return torch.cat([torch.addmm(squared, rows, centre.T, alpha=-2).argmin(1) for rows in x.split(_BLOCK)])
 
 
 def _means(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
 
 def upsample(features: Float[Tensor, "c h w"], *, cells: int) -> Float[Tensor, "c cells_y cells_x"]:
@@ -19,3 +19,18 @@ def root_mean_square_norm(samples: Float[Tensor, "m c"]) -> Float[Tensor, ""]:
     """Root of the mean squared length of the rows; 1 where that is 0, so that it can divide."""
     norm = (samples * samples).sum(1).mean().sqrt()
     return torch.where(norm > 0, norm, torch.ones_like(norm))
+
+
+def side_by_side(
+    first: Float[Tensor, "n c h w"], second: Float[Tensor, "n d y x"], *, alpha: float
+) -> Float[Tensor, "n e h w"]:
+    """Both maps on the first's cells, float32: each of length 1 in every cell, times ``alpha`` and 1 - ``alpha``.
+
+    Zhang et al., NeurIPS 2023 (A Tale of Two Features). The second is resampled before it is scaled: bilinear, cell
+    edges on cell edges, antialiased when it shrinks. A cell that is zero in a map stays zero.
+    """
+    size = first.shape[2:]
+    if second.shape[2:] != size:
+        shrinks = second.shape[2] > size[0] or second.shape[3] > size[1]
+        second = interpolate(second.float(), size, mode="bilinear", align_corners=False, antialias=shrinks)
+    return torch.cat([alpha * normalize(first.float(), dim=1), (1 - alpha) * normalize(second.float(), dim=1)], dim=1)

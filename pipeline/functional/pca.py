@@ -29,6 +29,32 @@ def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Te
     return mean, _signed(leading)
 
 
+def principal_axes_in_blocks(
+    samples: Float[Tensor, "m c"], *, dim: int, block: int = 1 << 13
+) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
+    """As ``principal_axes``, of more samples than fit in float32: float16 is read block by block, sums are float64.
+
+    Results are float32. Raises ValueError for samples that are not finite.
+    """
+    blocks = samples.split(block)
+    mean = torch.stack([part.double().sum(0) for part in blocks]).sum(0) / len(samples)
+    gram = torch.zeros(len(mean), len(mean), dtype=torch.float64, device=samples.device)
+    for part in blocks:
+        centred = part.double() - mean
+        gram += centred.T @ centred
+    _, vectors = _leading(gram.cpu().numpy(), dim)
+    axes = torch.from_numpy(vectors).to(samples.device, torch.float32)
+    return mean.float(), _signed(axes)
+
+
+def projected(
+    samples: Float[Tensor, "m c"], mean: Float[Tensor, " c"], axes: Float[Tensor, "c k"], *, block: int = 1 << 13
+) -> Float[Tensor, "m k"]:
+    """Coordinates of samples, less the mean, on the axes, in float32."""
+    shift = mean @ axes
+    return torch.cat([part.float() @ axes - shift for part in samples.split(block)])
+
+
 def _leading(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
     size = len(gram)
     values, vectors = scipy.linalg.eigh(gram, subset_by_index=[max(0, size - dim), size - 1], driver="evr")

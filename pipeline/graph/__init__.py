@@ -5,6 +5,7 @@ anything is computed: a plan costs nothing, a step runs only what is missing, an
 touches no template and no backbone.
 
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
+template features -> what is fitted to them, where a stage stands on it             templates.py
 image -> proposals -> crops -> features, for a detector that describes them         proposals.py
 files, or features of proposals and templates -> detections                         detections.py
 image, detections -> query crops -> query features (by timestep and layer)          queries.py
@@ -24,9 +25,11 @@ from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.items.features import SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
+from pipeline.stages.fuse import TrainedFuser
 
 __all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
 
@@ -45,14 +48,24 @@ class Graph:
         """Raise BadInput for a device, weights or a layer that are not there, before any work."""
         self.run.runtime.torch_device()
         stages = self.run.stages
-        for where, layers in (("match.layer", (stages.match.layer,)), ("fuse.layers", stages.fuse.layers)):
-            for layer in layers:
-                try:
-                    stages.extract.feature_shape(layer)
-                except BadInput as fault:
-                    if "layer" in fault.where:
-                        raise BadInput(where, found=fault.found, needed=fault.needed) from None
-                    raise
+        if isinstance(stages.fuse, TrainedFuser):
+            stages.fuse.check(stages.extract.model)
+        asked = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
+        asked[stages.match.layer] = "match.layer"
+        for layer in stages.layers:
+            try:
+                stages.extract.feature_shape(layer)
+            except BadInput as fault:
+                if layer == SALIENCY_LAYER:
+                    needed = (
+                        f"an extractor with saliency (dino, dinov2) for {stages.correspond.kind}, or correspond=cosine"
+                    )
+                    raise BadInput(
+                        "correspond", found=f"{stages.extract.kind} without saliency", needed=needed
+                    ) from None
+                if "layer" in fault.where:
+                    raise BadInput(asked[layer], found=fault.found, needed=fault.needed) from None
+                raise
         if self.detections.proposals:
             self.detections.proposals.check()
 
@@ -73,9 +86,10 @@ class Graph:
         self.onboard()
         return self.poses.estimate()
 
-    def scores(self, scorer: Scorer) -> ScoreNodes:
-        """The node of the poses' scores."""
-        return ScoreNodes(self.run, self.templates, self.poses, scorer)
+    def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
+        """The node of the poses' scores, and with them those of the correspondences they were solved from."""
+        retrace = self.retracer() if correspondences else None
+        return ScoreNodes(self.run, self.templates, self.poses, scorer, retrace)
 
     def retracer(self) -> Retracer:
         """Shows how answers came about."""

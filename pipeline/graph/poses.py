@@ -18,7 +18,7 @@ from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
 POSES_VERSION = 1
-ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve")
+ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "refine")
 
 
 @dataclass(eq=False)
@@ -49,6 +49,8 @@ class PoseNodes:
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
             inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key
+        for n, fit in enumerate(stages.fits):
+            inputs[f"fit {n}"] = self.templates.fitted(obj_id, fit).key
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.run.K(image).tolist()]

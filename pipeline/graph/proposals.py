@@ -19,6 +19,7 @@ from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import proposal_of, proposal_record
 from pipeline.items.views import Crops, Proposal
+from pipeline.spec import digest
 from pipeline.stages.detect import DescribingDetector
 from pipeline.stages.detect.proposals import Proposing
 from pipeline.stages.extract import Extractor
@@ -90,7 +91,10 @@ class ProposalNodes:
     def crops(self, image: ImageId) -> Ref:
         """Their crops."""
         recipe = {"kind": "proposal crops", "crop": self.run.stages.crop.recipe()}
-        return make_ref("crops", recipe, {"proposals": self.proposals(image).key})
+        inputs = {"proposals": self.proposals(image).key}
+        if self.run.stages.crop.needs_camera:
+            inputs["camera"] = digest(self.run.K(image).tolist())
+        return make_ref("crops", recipe, inputs)
 
     def features(self, image: ImageId) -> Ref:
         """Features of these that descriptors are read from; none for an image without a crop."""
@@ -139,11 +143,11 @@ class ProposalNodes:
         if self.run.store.complete(ref):
             return self.run.store.read(ref).rows
         start = time.perf_counter()
-        rgb = self.run.dataset.image(*image).rgb
+        photo = self.run.dataset.image(*image)
         crops, kept = [], []
         for position, proposal in enumerate(proposals):
             try:
-                crops.append(self.run.stages.crop(rgb, decode(proposal.rle), proposal.bbox_xyxy))
+                crops.append(self.run.stages.crop(photo.rgb, decode(proposal.rle), proposal.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose:
                 continue  # it cannot be an object that a pose could be found of

@@ -68,6 +68,8 @@ class QueryNodes:
         shown = [[d.obj_id, list(d.bbox_xyxy), d.rle] for _, d in self.of_image[image]]
         recipe = {"kind": "query crops", "crop": self.run.stages.crop.recipe()}
         inputs = {"image": file_digest(self.run.dataset.image_path(*image)), "detections": digest(shown)}
+        if self.run.stages.crop.needs_camera:
+            inputs["camera"] = digest(self.run.K(image).tolist())
         return make_ref("crops", recipe, inputs)
 
     def features(self, image: ImageId, layer: int) -> Ref:
@@ -102,12 +104,12 @@ class QueryNodes:
     def _cropped(self, image: ImageId) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], dict[str, object]]:
         """Crops, and which of the image's usable detections they are or why there is none."""
         usable = self.of_image[image]
-        rgb = self.run.dataset.image(*image).rgb
+        photo = self.run.dataset.image(*image)
         crops, kept, failed = [], [], {}
         for position, (_, detection) in enumerate(usable):
             try:
                 mask = None if detection.rle is None else decode(detection.rle)
-                crops.append(self.run.stages.crop(rgb, mask, detection.bbox_xyxy))
+                crops.append(self.run.stages.crop(photo.rgb, mask, detection.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose as failure:
                 failed[str(position)] = failure.reason

@@ -7,16 +7,21 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import Any
+
+import numpy as np
 
 from pipeline.bop.results import ResultRow
 from pipeline.digests import files_digest
 from pipeline.graph.context import Context
 from pipeline.graph.plan import Node
 from pipeline.graph.poses import PoseNodes
+from pipeline.graph.retrace import Retracer
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors, TemplateError, errors_of, errors_record, scores_of, scores_record
+from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
 from pipeline.scoring import SCORES_VERSION, Scored, Scorer, truth_digest
 from pipeline.store import Ref, make_ref
@@ -27,27 +32,36 @@ Instance = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A run's answers held against the ground truth. ``of[i]``: errors of answer i against the instance it is of."""
+    """A run's answers held against the ground truth. ``of[i]``: errors of answer i against the instance it is of.
+
+    ``correspondences``: median error of an instance's correspondences over its diameter, where they were asked for.
+    """
 
     scored: Scored
     of: tuple[PoseErrors | None, ...]
     templates: Mapping[Instance, TemplateError]
+    correspondences: Mapping[Instance, float]
 
 
 @dataclass(eq=False)
 class ScoreNodes:
-    """The entry of a run's scores. ``scorer`` says what poses are held against."""
+    """The entry of a run's scores. ``scorer`` says what poses are held against; ``retrace`` shows correspondences.
+
+    Without ``retrace`` they are not looked at: it takes as long as finding the poses did.
+    """
 
     run: Context
     templates: TemplateNodes
     poses: PoseNodes
     scorer: Scorer
+    retrace: Retracer | None = None
 
     @cached_property
     def ref(self) -> Ref:
         """Scores of the run's poses."""
         scorer, data = self.scorer, self.run.dataset
         recipe = {"kind": "scores", "version": SCORES_VERSION, "vsd_delta_mm": scorer.vsd_delta_mm}
+        recipe |= {"correspondences": True} if self.retrace else {}
         depth = "" if scorer.no_vsd else files_digest({str(image): data.depth_path(*image) for image in scorer.images})
         meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.run.object_ids}
         info = data.model_path(0, folder=scorer.models).with_name("models_info.json")
@@ -76,6 +90,7 @@ class ScoreNodes:
             Scored(errors, scores_of(entry.document["scores"]), self.scorer.models),
             _by_answer(answers, errors),
             templates,
+            {(s, i, o, g): error for s, i, o, g, error in entry.document.get("correspondences", [])},
         )
 
     def _make(self, answers: Sequence[Answer]) -> None:
@@ -88,12 +103,35 @@ class ScoreNodes:
             for answer, errors in zip(answers, of, strict=True)
             if (instance := _instance(answer, errors)) and (error := self._template_error(answer, instance))
         }
-        document = {
+        document: dict[str, Any] = {
             "errors": [errors_record(errors) for errors in scored.errors],
             "scores": scores_record(scored.scores),
             "templates": [[*instance, *asdict(error).values()] for instance, error in angles.items()],
         }
+        if self.retrace:
+            document["correspondences"] = self._correspondence_errors(answers, of)
         self.run.store.put_document(self.ref, document, rows=len(answers), time_s=time.perf_counter() - start)
+
+    def _correspondence_errors(
+        self, answers: Sequence[Answer], of: Sequence[PoseErrors | None]
+    ) -> list[list[int | float]]:
+        """Each instance with the median error of its answer's correspondences, over the diameter."""
+        assert self.retrace is not None
+        found: list[list[int | float]] = []
+        with self.run.tally.bar(len(answers), "correspondences", "answer") as advance:
+            for answer, errors in sorted(zip(answers, of, strict=True), key=lambda pair: pair[0].obj_id):
+                advance(1)
+                instance, traced = _instance(answer, errors), self.retrace(answer)
+                best = traced and traced.hypothesis
+                if instance is None or not best or best.points_obj is None or best.query_px_img is None:
+                    continue
+                scene_id, im_id, obj_id, gt_id = instance
+                T_gt = self.run.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
+                model, K = self.scorer.shape(obj_id).model, self.run.K((scene_id, im_id))
+                off = correspondence_errors_mm(best.points_obj, best.query_px_img, K, T_gt, model.symmetries)
+                if len(off):
+                    found.append([*instance, float(np.median(off)) / model.diameter_mm])
+        return found
 
     def _template_error(self, answer: Answer, instance: Instance) -> TemplateError | None:
         """How far the template that was matched lies from the true view; None where none was."""

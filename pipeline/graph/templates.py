@@ -1,7 +1,8 @@
-"""mesh -> templates -> template crops -> template features, once for every object; and the bank read back from them."""
+"""mesh -> templates -> crops -> features -> fits, once for every object; and the bank read back from them."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -11,8 +12,10 @@ import torch
 
 from pipeline.errors import DzopError
 from pipeline.graph.context import Context, stacked
+from pipeline.items.features import TemplateCells
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.route import TemplateView
+from pipeline.stages.fit import Fit, Fitted, chain, foreground_cells
 from pipeline.store import Layout, Ref, make_ref
 
 VIEWS_PER_BATCH = 8
@@ -23,10 +26,21 @@ CROPS_PER_BATCH = 50
 class StoredBank:
     """One object's templates as the online route reads them; views are read one by one and the last few kept."""
 
-    features: torch.Tensor
-    mask: torch.Tensor
+    maps: Callable[[], torch.Tensor]
+    masks: Callable[[], torch.Tensor]
     view: Callable[[int], TemplateView]
     poses: Callable[[], np.ndarray]
+    fitted: Callable[[Fit], Fitted]
+
+    @cached_property
+    def features(self) -> torch.Tensor:
+        """Features of the match layer, float16; read when a matcher asks, for they are most of what an object takes."""
+        return self.maps()
+
+    @cached_property
+    def mask(self) -> torch.Tensor:
+        """Crop masks of all templates; read when a matcher asks."""
+        return self.masks()
 
     @cached_property
     def T_cam_obj(self) -> np.ndarray:
@@ -97,7 +111,8 @@ class TemplateNodes:
             views = self.read_views(obj_id, rows)
             h, w = views.mask.shape[1:]
             whole = (-0.5, -0.5, w - 0.5, h - 0.5)
-            crops = [self.run.stages.crop(rgb, mask, whole) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
+            crop = self.run.stages.crop
+            crops = [crop(rgb, mask, whole, views.K) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
             return {ref.key: stacked(crops)}
 
         self.run.fill(
@@ -119,11 +134,60 @@ class TemplateNodes:
             geometry = Geometry(list(views.depth_mm), np.repeat(views.K[None], len(rows), 0), views.T_cam_obj)
         return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
 
+    def fitted(self, obj_id: int, fit: Fit) -> Ref:
+        """What a fit makes of an object's template features."""
+        inputs = {"features": self.features(obj_id, fit.layer).key}
+        if fit.base is not None:
+            inputs["base"] = self.fitted(obj_id, fit.base).key
+        return make_ref("fitted", {"kind": "fitted", "fit": fit.recipe()}, inputs)
+
+    def make_fitted(self, obj_id: int) -> None:
+        """Fit what is missing to an object's templates; what a fit stands on comes before it."""
+        cells = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer))
+        for fit in self.run.stages.fits:
+            ref, start = self.fitted(obj_id, fit), time.perf_counter()
+            if self.run.store.complete(ref):
+                self.run.tally.add("fits", reused=1)
+                continue
+            base = {} if fit.base is None else self.read_fitted(obj_id, fit.base, device="cpu")
+            arrays = {name: array.numpy() for name, array in fit(cells(fit.layer), base).items()}
+            self.run.tally.add("fits", time_s=time.perf_counter() - start)
+            self._keep(ref, arrays)
+
+    def _keep(self, ref: Ref, arrays: dict[str, np.ndarray]) -> None:
+        """Store arrays of any shapes as an entry of one row."""
+
+        def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
+            return {ref.key: {name: array[None] for name, array in arrays.items()}}
+
+        layouts = {name: Layout(array.shape, array.dtype.name) for name, array in arrays.items()}
+        self.run.fill("fits", "", {ref: layouts}, 1, 1, compute)
+
+    def read_fitted(self, obj_id: int, fit: Fit, *, device: str) -> Fitted:
+        """Arrays of a fit and of all it stands on."""
+        arrays: dict[str, torch.Tensor] = {}
+        for part in chain(fit):
+            entry = self.run.store.read(self.fitted(obj_id, part))
+            arrays |= {name: torch.from_numpy(entry.array(name)[0]).to(device) for name in entry.arrays}
+        return arrays
+
+    def _cells(self, obj_id: int, layer: int) -> TemplateCells:
+        """Foreground of an object's templates, float16; whole maps are read a few at a time."""
+        maps, crops = self.run.store.read(self.features(obj_id, layer)), self.run.store.read(self.crops(obj_id))
+        features, template = [], []
+        for first in range(0, crops.rows, CROPS_PER_BATCH):
+            rows = range(first, min(first + CROPS_PER_BATCH, crops.rows))
+            part = foreground_cells(*(torch.from_numpy(e.array(n, rows)) for e, n in ((maps, "maps"), (crops, "mask"))))
+            features.append(part.features)
+            template.append(part.template + first)
+        return TemplateCells(torch.cat(features), torch.cat(template), crops.rows)
+
     def onboard(self, obj_id: int) -> None:
         """Everything offline of one object."""
         count = self.make_templates(obj_id)
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.run.stages.layers)
+        self.make_fitted(obj_id)
 
     def feature_bytes(self) -> int:
         """What the stored features of all objects take."""
@@ -148,6 +212,14 @@ class TemplateNodes:
                 T_cam_obj=templates.array("T_cam_obj", [index])[0],
             )
 
-        match_layer = features[self.run.stages.match.layer].array("maps")
-        mask = self.run.tensor(crops.array("mask"))
-        return StoredBank(self.run.tensor(match_layer), mask, view, lambda: templates.array("T_cam_obj"))
+        @lru_cache(maxsize=4)
+        def fitted(fit: Fit) -> Fitted:
+            return self.read_fitted(obj_id, fit, device=self.run.device)
+
+        return StoredBank(
+            maps=lambda: self.run.tensor(features[self.run.stages.match.layer].array("maps")),
+            masks=lambda: self.run.tensor(crops.array("mask")),
+            view=view,
+            poses=lambda: templates.array("T_cam_obj"),
+            fitted=fitted,
+        )

@@ -22,7 +22,7 @@ CLASS_TOKEN_LAYER = -2
 class FusedPair:
     """Query and template in one feature space, at the resolution of the finest layer.
 
-    ``note`` says what was clamped or skipped, "" when nothing was.
+    ``note`` says what was clamped or skipped, "" when nothing was. Saliency, 0 to 1, is there for those who need it.
     """
 
     query: Float[Tensor, "d h w"]
@@ -30,6 +30,8 @@ class FusedPair:
     query_mask: Bool[Tensor, "h w"]
     template_mask: Bool[Tensor, "h w"]
     note: str = ""
+    query_saliency: Float[Tensor, "h w"] | None = None
+    template_saliency: Float[Tensor, "h w"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,3 +42,12 @@ class Clusters:
     template_label: Int[Tensor, "h w"]
     pairs: Int[Tensor, "p 2"]
     note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateCells:
+    """Features of one layer in all foreground cells of an object's n templates. ``template``: which one each is of."""
+
+    features: Float[Tensor, "m c"]
+    template: Int[Tensor, " m"]
+    templates: int

@@ -11,7 +11,10 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """A solver's answer. ``reprojection_px``: root mean square over the inliers, in the query image."""
+    """A solver's answer, or a refined one: ``inliers`` are those of the solver's pose either way.
+
+    ``reprojection_px``: root mean square over these inliers under T_cam_obj, in the query image.
+    """
 
     T_cam_obj: Float[np.ndarray, "4 4"]
     inliers: Bool[np.ndarray, " m"]

@@ -294,6 +294,11 @@ class Entry:
         return float(self.record["time_s"])
 
     @property
+    def arrays(self) -> list[str]:
+        """Names of the entry's arrays."""
+        return sorted(self.record["arrays"])
+
+    @property
     def document(self) -> Any:
         """The entry's JSON document."""
         return self.group.attrs["document"]

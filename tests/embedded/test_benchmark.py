@@ -1,20 +1,47 @@
 """The benchmark's table: every system on every data set, the test seed among no other seeds in use."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.embedded import benchmark
+from pipeline.items.scores import Scores
+from pipeline.report.rows import Row
 
 
-def test_every_system_has_a_row_on_every_data_set(monkeypatch, tmp_path):
+def row(*, correct: bool) -> Row:
+    """Twelve instances in four images, all right or all wrong."""
+    n = 12
+    hit = np.full((n, 10), correct)
+    scores = Scores(np.ones(n, int), np.arange(n) % 4, np.arange(n), np.zeros(n, int), np.ones(n), hit, hit, None, "")
+    metrics = {"AR_MSSD": float(correct), "AR_MSPD": float(correct), "AR_VSD": None}
+    metrics |= {"Acc15_geodesic": 0.25, "template_error_geodesic_deg": 12.34}
+    return Row("0", "done", "2026", "m", {}, {}, metrics=metrics, scores=scores)
+
+
+def test_every_system_has_a_row_on_every_data_set_and_the_lead_is_paired(monkeypatch, tmp_path):
     asked = []
 
     def run(choices, out: Path, cache: Path):
         asked.append((tuple(choices), out))
-        return {"AR": 0.5, "template_error_geodesic_deg": 12.34}
+        return row(correct="HOG" not in str(out))
 
     monkeypatch.setattr(benchmark, "_run", run)
     text = benchmark.benchmark(tmp_path, lmo=tmp_path / "lmo", detections=tmp_path / "found.json")
     assert len(asked) == 3 * len(benchmark.SYSTEMS)
     assert len({out for _, out in asked}) == len(asked)
-    assert text.count("| HOG | - | 12.3 | 0.500 | - | - |") == 3
+    wrong, lead = "0.000 [0.000, 0.000]", "1.000 [1.000, 1.000]"
+    assert text.count(f"| HOG | 0.250 | 12.3 | - | {wrong} | {wrong} | {wrong} | {lead} |") == 3
+    assert text.count("AR_VSD") == 0
     assert f"dataset.seed={benchmark.TEST_SEED}" in asked[0][0]
+
+
+def test_recalls_of_vsd_are_a_column_where_they_are_known(monkeypatch, tmp_path):
+    def run(*_):
+        plain = row(correct=True)
+        scores = replace(plain.scores, vsd=np.ones((12, 10, 10), bool))
+        return replace(plain, scores=scores, metrics=dict(plain.metrics) | {"AR_VSD": 1.0})
+
+    monkeypatch.setattr(benchmark, "_run", run)
+    assert "| AR_VSD | AR_MSSD | AR_MSPD | mean |" in benchmark.benchmark(tmp_path)

@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline.embedded import losses, views
 from pipeline.embedded.batches import CELLS, QUERIES, TEMPLATES, Source, pair_batch, picture_batch
 from pipeline.embedded.export import export
 from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
+from pipeline.embedded.views import CLUSTERS_PER_OBJECT
 
 PLAN = Plan(shards=1, autoencoder=3, denoiser=2, descriptors=2)
 
@@ -46,30 +48,53 @@ def test_a_batch_depends_on_its_step_alone(shards):
     assert not torch.equal(first, other)
 
 
-def test_correspondences_are_of_one_object_point(shards):
-    """Where albedo is plain the colours of both ends agree; what is checked here is geometry: ends lie on the masks."""
+def test_correspondences_end_on_the_object_and_angles_are_those_of_all_templates(shards):
     batch = pair_batch(source(shards), 0, count=1)
-    assert batch.query_xy.shape[:4] == (1, QUERIES, TEMPLATES, batch.matched.shape[-1])
+    clusters = CLUSTERS_PER_OBJECT
+    assert batch.query_xy.shape[:4] == (1, clusters, QUERIES, TEMPLATES)
+    assert batch.angle_deg.shape == (1, clusters, QUERIES, clusters * TEMPLATES)
     assert batch.matched.any()
-    inside = batch.mask.reshape(1, QUERIES + TEMPLATES, 128, 128)
-    for q in range(QUERIES):
-        for t in range(TEMPLATES):
-            ends = batch.template_xy[0, q, t][batch.matched[0, q, t]]
-            px = ((ends + 0.5) * 128 / CELLS - 0.5).round().long().clamp(0, 127)
-            assert inside[0, QUERIES + t, px[:, 1], px[:, 0]].float().mean() > 0.95 if len(px) else True
-    assert float(batch.angle_deg.min()) < 10
+    inside = batch.mask.reshape(clusters, QUERIES + TEMPLATES, 128, 128)
+    for c in range(clusters):
+        for q in range(QUERIES):
+            for t in range(TEMPLATES):
+                ends = batch.template_xy[0, c, q, t][batch.matched[0, c, q, t]]
+                px = ((ends + 0.5) * 128 / CELLS - 0.5).round().long().clamp(0, 127)
+                assert inside[c, QUERIES + t, px[:, 1], px[:, 0]].float().mean() > 0.95 if len(px) else True
+        own = batch.angle_deg[0, c, 0, c * TEMPLATES : (c + 1) * TEMPLATES]
+        assert float(own[0]) < 10
+        assert float(own.min()) == float(batch.angle_deg[0, c, 0].min())
 
 
-def test_the_same_features_at_corresponding_cells_are_a_small_loss(shards):
+def test_the_loss_is_least_where_cosines_peak_at_the_true_places(shards):
+    """Directions that turn with the place: the query's cells are given those of their counterparts in a template."""
     batch = pair_batch(source(shards), 0, count=1)
-    n, k = QUERIES + TEMPLATES, torch.arange(CELLS * CELLS)
-    place_of = torch.stack([k % CELLS, k // CELLS]).float().reshape(1, 2, CELLS, CELLS).expand(n, -1, -1, -1)
-    cosine, inside = losses.correspondence_logits(torch.randn(n, 8, CELLS, CELLS), batch)
-    random = losses.correspondence_loss(cosine, inside, batch, torch.tensor(10.0))
-    xy = torch.stack([k % CELLS, k // CELLS], -1).float()
-    exact = -(batch.template_xy[..., None, :] - xy).square().sum(-1) / 10
-    assert losses.correspondence_loss(exact, inside, batch, torch.tensor(10.0)) < random / 2
-    assert place_of.shape[0] == n
+    maps = torch.randn(CLUSTERS_PER_OBJECT * (QUERIES + TEMPLATES), 256, CELLS, CELLS)
+    random = losses.correspondence_loss(maps, batch, torch.tensor(20.0))
+    whole = batch.template_xy.clamp(0, CELLS - 1).round()
+    only = replace(batch, matched=batch.matched.clone(), template_xy=whole)
+    only.matched[:, :, :, 1:] = False
+    only.matched[:, :, 1:] = False
+    told = maps.clone()
+    for c in range(CLUSTERS_PER_OBJECT):
+        first = c * (QUERIES + TEMPLATES)
+        for k in torch.nonzero(only.matched[0, c, 0, 0])[:, 0]:
+            x, y = only.query_xy[0, c, 0, 0, k].long()
+            u, v = only.template_xy[0, c, 0, 0, k].long()
+            told[first, :, y, x] = maps[first + QUERIES, :, v, u]
+    assert losses.correspondence_loss(told, only, torch.tensor(20.0)) < random / 2
+
+
+def test_a_query_scores_itself_highest_among_templates(shards):
+    batch = pair_batch(source(shards), 0, count=1)
+    n = QUERIES + TEMPLATES
+    maps = torch.randn(CLUSTERS_PER_OBJECT * n, 16, 16, 16)
+    batch.mask[:] = True
+    maps[QUERIES + 2] = maps[0]
+    scores = losses.retrieval_scores(maps, batch)
+    assert scores.shape == batch.angle_deg.shape
+    assert int(scores[0, 0, 0].argmax()) == 2
+    assert float(scores[0, 0, 0, 2]) == pytest.approx(1, abs=1e-5)
 
 
 @pytest.mark.slow
@@ -97,10 +122,13 @@ def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(place, tmp_pa
     names = {path.name for path in (tmp_path / "weights").iterdir()}
     assert names == {
         "config.json",
-        "steps.json",
+        "losses.json",
         "vae.safetensors",
         "unet_pure.safetensors",
         "unet_learned.safetensors",
         "head.safetensors",
     }
     assert size < 25_000_000
+    curves = json.loads((tmp_path / "weights" / "losses.json").read_text())
+    assert [record["step"] for record in curves["denoiser"]] == [0, 1]
+    assert curves["autoencoder"][0]["loss"] == curve(place, "autoencoder")[0]

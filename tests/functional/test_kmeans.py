@@ -49,3 +49,11 @@ def test_fewer_distinct_points_than_clusters_give_one_cluster_each():
     assert len(centre) == 3
     assert torch.equal(centre[label], points)
     assert kmeans(points[:1], count=10, seed=0, iterations=20)[0].tolist() == [0]
+
+
+def test_more_points_than_a_block_get_the_labels_of_one_block(monkeypatch):
+    whole = kmeans(_points(), count=40, seed=0, iterations=20)
+    monkeypatch.setattr("pipeline.functional.kmeans._BLOCK", 64)
+    blocks = kmeans(_points(), count=40, seed=0, iterations=20)
+    assert torch.equal(whole[0], blocks[0])
+    assert torch.allclose(whole[1], blocks[1])

@@ -3,7 +3,7 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from pipeline.functional.pca import principal_axes
+from pipeline.functional.pca import principal_axes, principal_axes_in_blocks, projected
 
 
 def _samples(m: int, c: int) -> torch.Tensor:
@@ -47,3 +47,17 @@ def test_dimensions_are_clamped_to_what_the_samples_span(m, c):
 def test_equal_samples_span_no_axis():
     assert principal_axes(torch.ones(5, 7), dim=3)[1].shape == (7, 0)
     assert principal_axes(torch.ones(1, 7), dim=3)[1].shape == (7, 0)
+
+
+@pytest.mark.parametrize(("m", "c"), [(20, 300), (300, 20)])
+def test_axes_in_blocks_equal_those_of_scikit_learn_whatever_the_blocks(m, c):
+    samples = _samples(m, c).half()
+    reference = PCA(n_components=8, svd_solver="full").fit(samples.double().numpy())
+    for block in (7, 1000):
+        mean, axes = principal_axes_in_blocks(samples, dim=8, block=block)
+        assert mean.dtype == axes.dtype == torch.float32
+        assert np.allclose(mean.numpy(), reference.mean_, atol=1e-6)
+        assert (np.abs(np.sum(axes.numpy() * reference.components_.T, axis=0)) > 1 - 1e-6).all()
+        expected = reference.transform(samples.double().numpy())
+        found = projected(samples, mean, axes, block=block).numpy()
+        assert np.allclose(found, np.sign((found * expected).sum(0)) * expected, atol=1e-4)  # float32 of values about 5

@@ -2,11 +2,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BadInput, NoPose
-from pipeline.functional.camera import apply
+from pipeline.functional.camera import apply, crop_camera, local_zoom, project
 from pipeline.spec import build
 from pipeline.stages.crop.square import Square
+from pipeline.stages.crop.virtual import Virtual
 
 WHOLE = (-0.5, -0.5, 119.5, 89.5)
+K = np.array([[90.0, 0.0, 59.5], [0.0, 95.0, 44.5], [0.0, 0.0, 1.0]])
 
 
 def _scene() -> tuple[np.ndarray, np.ndarray]:
@@ -19,8 +21,8 @@ def _scene() -> tuple[np.ndarray, np.ndarray]:
 
 def test_image_enlarged_three_times_gives_the_same_crop():
     rgb, mask = _scene()
-    crop, crop_mask, A = Square(size=24)(rgb, mask, WHOLE)
-    large, large_mask, A_large = Square(size=24)(*(a.repeat(3, 0).repeat(3, 1) for a in (rgb, mask)), WHOLE)
+    crop, crop_mask, A = Square(size=24)(rgb, mask, WHOLE, K)
+    large, large_mask, A_large = Square(size=24)(*(a.repeat(3, 0).repeat(3, 1) for a in (rgb, mask)), WHOLE, K)
     assert np.abs(crop.astype(int) - large).max() <= 1  # float32 sums may round a half the other way
     assert np.array_equal(crop_mask, large_mask)
     corner = np.array([[30.0, 20.0]])
@@ -30,29 +32,31 @@ def test_image_enlarged_three_times_gives_the_same_crop():
 def test_image_moved_by_whole_pixels_gives_the_same_crop():
     rgb, mask = _scene()
     moved = (np.pad(rgb, ((7, 0), (11, 0), (0, 0))), np.pad(mask, ((7, 0), (11, 0))))
-    for a, b in zip(Square()(rgb, mask, WHOLE)[:2], Square()(*moved, WHOLE)[:2], strict=True):
+    for a, b in zip(Square()(rgb, mask, WHOLE, K)[:2], Square()(*moved, WHOLE, K)[:2], strict=True):
         assert np.abs(a.astype(int) - b).max() <= 1  # A's last bits differ, a half may round the other way
 
 
 def test_mask_fills_the_crop_up_to_the_padding():
-    _, crop_mask, _ = Square(size=120, padding_ratio=1.2)(*_scene(), WHOLE)
+    _, crop_mask, _ = Square(size=120, padding_ratio=1.2)(*_scene(), WHOLE, K)
     rows, columns = np.flatnonzero(crop_mask.any(1)), np.flatnonzero(crop_mask.any(0))
     assert (rows[0], rows[-1]) == (10, 109)  # 50 px of 60 in height
     assert (columns[0], columns[-1]) == (20, 99)  # 40 px of 60 in width
 
 
-def test_background_never_reaches_the_crop():
+@pytest.mark.parametrize("variant", [Square, Virtual])
+def test_background_never_reaches_the_crop(variant):
     rgb, mask = _scene()
     other = np.where(mask[..., None], rgb, 255 - rgb)
-    assert np.array_equal(Square()(rgb, mask, WHOLE)[0], Square()(other, mask, WHOLE)[0])
-    kept = Square(background="keep")
-    assert not np.array_equal(kept(rgb, mask, WHOLE)[0], kept(other, mask, WHOLE)[0])
+    assert np.array_equal(variant()(rgb, mask, WHOLE, K)[0], variant()(other, mask, WHOLE, K)[0])
+    kept = variant(background="keep")
+    assert not np.array_equal(kept(rgb, mask, WHOLE, K)[0], kept(other, mask, WHOLE, K)[0])
 
 
-def test_box_counts_only_without_a_mask():
+@pytest.mark.parametrize("variant", [Square, Virtual])
+def test_box_counts_only_without_a_mask(variant):
     rgb, mask = _scene()
-    with_mask = Square()(rgb, mask, (0.0, 0.0, 5.0, 5.0))
-    crop, crop_mask, A = Square()(rgb, None, (29.5, 19.5, 69.5, 69.5))
+    with_mask = variant()(rgb, mask, (0.0, 0.0, 5.0, 5.0), K)
+    crop, crop_mask, A = variant()(rgb, None, (29.5, 19.5, 69.5, 69.5), K)
     assert np.array_equal(A, with_mask[2])
     assert crop_mask.sum() > with_mask[1].sum()
     assert crop[crop_mask].min() > 0
@@ -62,13 +66,54 @@ def test_object_at_the_border_stays_where_it_is():
     rgb = np.full((40, 40, 3), 200, np.uint8)
     mask = np.zeros((40, 40), bool)
     mask[:10, :10] = True
-    crop, crop_mask, A = Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE)
+    crop, crop_mask, A = Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, K)
     assert np.array_equal(A[:2, 2], [10.5, 10.5])  # two crop pixels a pixel, image edge -0.5 at crop edge 9.5
     assert not crop[:9].any()
     assert not crop_mask[:10].any()
     assert crop_mask[10:30, 10:30].all()
 
 
+def test_what_the_virtual_camera_shows_is_where_its_projection_says():
+    """Small spheres in space, drawn as dots in a photograph, lie in the crop where the virtual camera projects them."""
+    far = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
+    points = np.array([[260.0, 150.0, 600.0], [290.0, 160.0, 640.0], [275.0, 190.0, 700.0], [240.0, 195.0, 620.0]])
+    y, x = np.mgrid[:240, :320]
+    px = project(far, points)
+    dots = [np.exp(-((x - u) ** 2 + (y - v) ** 2) / 4.5) for u, v in px]
+    low, high = px.min(0) - 4, px.max(0) + 4
+    for n, dot in enumerate(dots):
+        rgb = np.rint(255 * dot)[..., None].repeat(3, -1).astype(np.uint8)
+        crop, _, A = Virtual(size=200)(rgb, None, (*low, *high), far)
+        K_crop, R_crop_cam = crop_camera(A, far)
+        weight = crop[..., 0].astype(float)
+        seen = np.array([(weight * axis).sum() for axis in np.mgrid[:200, :200][::-1]]) / weight.sum()
+        expected = project(K_crop, R_crop_cam @ points[n])
+        error = np.abs(seen - expected).max() / local_zoom(A, px[n])
+        assert error < 0.1  # image px; a dot's centre of mass is not quite the image of its centre
+
+
+def test_virtual_crop_at_the_border_stays_where_it_is():
+    rgb, mask = np.full((40, 40, 3), 200, np.uint8), np.zeros((40, 40), bool)
+    mask[:10, :10] = True
+    straight = np.array([[60.0, 0.0, 4.5], [0.0, 60.0, 4.5], [0.0, 0.0, 1.0]])  # looks at the mask's centre
+    crop, crop_mask, A = Virtual(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, straight)
+    np.testing.assert_allclose(A, Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, straight)[2], atol=1e-12)
+    assert not crop[:9].any()
+    assert crop_mask[10:30, 10:30].all()
+    assert not crop_mask[:10].any()
+
+
+def test_a_turned_virtual_camera_sees_the_object_in_the_middle():
+    rgb, mask = _scene()
+    _, crop_mask, A = Virtual(size=60)(rgb, mask, WHOLE, K)
+    assert A[2, 0] != 0  # K is wide: the mask's centre is 14 degrees off the axis
+    corners = apply(A, np.array([[29.5, 19.5], [69.5, 69.5]]))
+    assert (corners > -0.5).all()
+    assert (corners < 59.5).all()
+    assert crop_mask.any(0).sum() > 35
+
+
+@pytest.mark.parametrize("variant", [Square, Virtual])
 @pytest.mark.parametrize(
     ("mask", "bbox", "reason"),
     [
@@ -79,9 +124,9 @@ def test_object_at_the_border_stays_where_it_is():
         (None, (200.0, 10.0, 210.0, 30.0), "box (200, 10, 210, 30) holds no pixel of the 120 x 90 image"),
     ],
 )
-def test_nothing_to_crop_says_why(mask, bbox, reason):
+def test_nothing_to_crop_says_why(variant, mask, bbox, reason):
     with pytest.raises(NoPose, match="crop: ") as failure:
-        Square()(_scene()[0], mask, bbox)
+        variant()(_scene()[0], mask, bbox, K)
     assert failure.value.reason == reason
 
 

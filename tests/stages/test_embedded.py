@@ -12,7 +12,9 @@ from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
 from pipeline.stages.extract.embedded import Embedded
+from pipeline.stages.fuse.auto import Auto
 from pipeline.stages.fuse.learned import Learned
+from pipeline.stages.fuse.pca import Pca
 
 LAYERS = (2, 5, 8, 11)
 
@@ -58,13 +60,24 @@ def test_missing_weights_say_how_to_make_them(tmp_path, monkeypatch):
     embedded.shipped_config.cache_clear()
 
 
-def test_the_head_fuses_both_sides_alike_and_refuses_other_features():
+def test_the_head_fuses_both_sides_alike_at_twice_the_finest_layers_cells():
     maps = Embedded().load(Runtime(device="cpu"))(crops(1), LAYERS)
     one = {layer: m[0] for layer, m in maps.items()}
     mask = torch.ones(128, 128, dtype=torch.bool)
     pair = Learned()(one, one, mask, mask)
     torch.testing.assert_close(pair.query, pair.template)
-    assert pair.query.shape[-1] == 32
-    other = {layer: m[:3] for layer, m in one.items()}
-    with pytest.raises(BadInput, match=r"needs channels .* of extract=embedded"):
-        Learned()(other, other, mask, mask)
+    assert pair.query.shape[-1] == 2 * one[11].shape[-1]
+
+
+def test_the_head_refuses_features_it_was_not_trained_on():
+    Learned().check(Embedded().model)
+    with pytest.raises(BadInput, match=r"features of embedded-pure-.* needs extract=embedded extract.weights=learned"):
+        Learned().check(Embedded(weights="pure").model)
+    with pytest.raises(BadInput, match=r"fuse.layers: found \[2, 5\], needs \[2, 5, 8, 11\]"):
+        Learned(layers=(2, 5)).check(Embedded().model)
+
+
+def test_auto_takes_the_head_where_the_features_have_one():
+    assert Auto().resolve_for(Embedded().model) == Learned()
+    assert Auto(layers=(5, 8)).resolve_for(Embedded(weights="pure").model) == Pca(layers=(5, 8))
+    assert Auto().resolve_for("hog") == Pca()

@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -6,8 +8,10 @@ from sklearn.decomposition import PCA
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.masks import cell_mask
 from pipeline.spec import build
+from pipeline.stages.fit import fitted_to, foreground_cells
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.pca import Pca
+from pipeline.stages.fuse.template_pca import TemplatePca
 
 LAYERS = (2, 5, 8)
 
@@ -28,7 +32,9 @@ def _masks() -> tuple[torch.Tensor, torch.Tensor]:
     return query, template
 
 
-@pytest.mark.parametrize("fuse", [Pca(layers=LAYERS, dim=9), Concat(layers=LAYERS)], ids=repr)
+@pytest.mark.parametrize(
+    "fuse", [Pca(layers=LAYERS, dim=9), Concat(layers=LAYERS), TemplatePca(layers=(8,), dim=4)], ids=repr
+)
 def test_fused_pair_has_the_finest_layers_resolution_and_masks(fuse):
     pair = fuse(_maps(0), _maps(1), *_masks())
     assert pair.query.shape == pair.template.shape
@@ -51,6 +57,20 @@ def test_projection_equals_scikit_learn_on_the_foreground_of_both():
     found = pair.query.flatten(1).numpy()
     sign = np.sign((found * expected).sum(1))[:, None]  # the reference has another rule for signs
     assert np.allclose(found, sign * expected, atol=2e-4)  # float32 Gram matrix, values about 2
+
+
+def test_axes_of_the_templates_project_both_sides():
+    query, template, fuse = _maps(0), _maps(1), TemplatePca(layers=(8,), dim=4)
+    bank = torch.stack([_maps(seed)[8] for seed in (1, 2, 3)])
+    arrays = fitted_to(fuse.fit, foreground_cells(bank, _masks()[1].expand(3, -1, -1)))
+    pair = fuse.by_fitted(query, template, *_masks(), arrays)
+    for found, side in ((pair.query, query), (pair.template, template)):
+        expected = torch.tensordot(arrays["axes"].T, side[8].float() - arrays["mean"][:, None, None], dims=1)
+        assert torch.allclose(found, expected, atol=1e-4)  # float32 of values about 5
+    # another query changes nothing in the template's map
+    assert torch.equal(pair.template, fuse.by_fitted(_maps(7), template, *_masks(), arrays).template)
+    few = TemplatePca(layers=(8,), dim=99).by_fitted(query, template, *_masks(), arrays)
+    assert few.note == "layer 8: 4 of 99 dimensions, the templates span no more"
 
 
 def test_normalised_layers_weigh_the_same_whatever_their_scale():
@@ -84,7 +104,9 @@ def test_nothing_to_fuse_says_why():
     maps, (mask, _), empty = _maps(0), _masks(), torch.zeros(32, 32, dtype=torch.bool)
     constant = {layer: torch.ones_like(m) for layer, m in maps.items()}
     broken = {layer: torch.full_like(m, torch.inf) for layer, m in maps.items()}
-    for fuse in (Pca(layers=LAYERS), Concat(layers=LAYERS)):
+    arrays = fitted_to(TemplatePca(layers=(2,)).fit, foreground_cells(maps[2][None], mask[None]))
+    fixed = partial(TemplatePca(layers=(2,)).by_fitted, fitted=arrays)
+    for fuse in (Pca(layers=LAYERS), Concat(layers=LAYERS), fixed):
         with pytest.raises(NoPose, match="fuse: template mask is empty, needs 1 pixel"):
             fuse(maps, maps, mask, empty)
         with pytest.raises(NoPose, match="fuse: features of layer 2 are not finite"):

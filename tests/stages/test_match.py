@@ -8,8 +8,10 @@ from pipeline.functional.rigid import look_at, rigid, rotation_between
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.masked_cosine import MaskedCosine
 from pipeline.stages.match.oracle import Oracle
+from pipeline.stages.match.words import Words
 
-VARIANTS = [Cosine(top_k=3), *(MaskedCosine(top_k=3, normalise=n) for n in ("intersection", "query", "union"))]
+PER_CELL = [Cosine(top_k=3), *(MaskedCosine(top_k=3, normalise=n) for n in ("intersection", "query", "union"))]
+WORDS = [Words(top_k=3, dim=8, count=40, weights=w) for w in ("equal", "gaussian")]
 
 
 def _bank(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
@@ -20,10 +22,10 @@ def _bank(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.randn(n, 10, 8, 8, generator=generator).half(), mask
 
 
-@pytest.mark.parametrize("match", VARIANTS, ids=repr)
-def test_template_finds_itself_whatever_the_scale_of_its_features(match):
+@pytest.mark.parametrize("match", [*PER_CELL, *WORDS], ids=repr)
+def test_template_finds_itself(match):
     bank, mask = _bank()
-    found = match(4 * bank[5].float(), mask[5], bank, mask)
+    found = match(bank[5].float(), mask[5], bank, mask)
     assert found.index.tolist()[0] == 5
     assert found.index.shape == found.score.shape == (3,)
     assert (found.score.diff() <= 0).all()
@@ -31,11 +33,20 @@ def test_template_finds_itself_whatever_the_scale_of_its_features(match):
     assert found.margin > 0
 
 
-def test_what_lies_outside_the_masks_changes_nothing_in_the_masked_cosine():
+@pytest.mark.parametrize("match", PER_CELL, ids=repr)
+def test_the_scale_of_the_querys_features_plays_no_part(match):
+    bank, mask = _bank()
+    first, second = (match(factor * bank[5].float(), mask[5], bank, mask) for factor in (1, 4))
+    assert torch.equal(first.index, second.index)
+    assert torch.allclose(first.score, second.score, atol=1e-6)
+
+
+@pytest.mark.parametrize("match", [MaskedCosine(), *WORDS], ids=repr)
+def test_what_lies_outside_the_masks_changes_nothing(match):
     bank, mask = _bank()
     query, background = bank[5].float(), torch.ones(10, 8, 8)
     other = torch.where(cell_mask(mask[5], cells=8), query, background)
-    first, second = (MaskedCosine()(q, mask[5], bank, mask) for q in (query, other))
+    first, second = (match(q, mask[5], bank, mask) for q in (query, other))
     assert torch.equal(first.index, second.index)
     assert torch.equal(first.score, second.score)
 
@@ -68,7 +79,24 @@ def test_of_equal_templates_the_first_wins_and_the_margin_is_to_the_first_left_o
     assert Cosine(top_k=50)(bank[1].float(), mask[1], bank, mask).index.shape == (9,)
 
 
-@pytest.mark.parametrize("match", VARIANTS, ids=repr)
+def test_words_that_are_hidden_in_part_and_moved_about_still_find_their_template():
+    bank, mask = _bank()
+    everywhere = torch.ones_like(mask)
+    shuffled = (
+        bank[5].flatten(1)[:, torch.randperm(64, generator=torch.Generator().manual_seed(1))].unflatten(1, (8, 8))
+    )
+    hidden = everywhere[5].clone()
+    hidden[:, 20:] = False
+    for match in WORDS:
+        assert match(shuffled.float(), hidden, bank, everywhere).index.tolist()[0] == 5
+
+
+def test_fewer_words_than_asked_for_are_those_there_are():
+    bank, mask = _bank(2)
+    assert Words(dim=300, assignments=9)(bank[1].float(), mask[1], bank, mask).index.tolist()[0] == 1
+
+
+@pytest.mark.parametrize("match", PER_CELL, ids=repr)
 def test_features_without_content_say_why(match):
     bank, mask = _bank()
     with pytest.raises(NoPose, match="match: query and templates share no feature"):
@@ -77,10 +105,11 @@ def test_features_without_content_say_why(match):
         match(torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
 
 
-def test_empty_query_mask_says_why():
+@pytest.mark.parametrize("match", [MaskedCosine(), *WORDS], ids=repr)
+def test_empty_query_mask_says_why(match):
     bank, mask = _bank()
     with pytest.raises(NoPose, match="match: query mask is empty, needs 1 pixel"):
-        MaskedCosine()(bank[0].float(), torch.zeros(32, 32, dtype=torch.bool), bank, mask)
+        match(bank[0].float(), torch.zeros(32, 32, dtype=torch.bool), bank, mask)
 
 
 def test_the_oracle_takes_the_nearest_view_off_the_axis_and_up_to_symmetries():
@@ -100,3 +129,11 @@ def test_the_oracle_cannot_work_without_the_truth():
     bank, mask = _bank()
     with pytest.raises(BadInput, match="match=oracle: found features, needs the true pose"):
         Oracle()(bank[0].float(), mask[0], bank, mask)
+
+
+def test_words_of_features_that_are_not_finite_or_tell_nothing_apart_say_why():
+    bank, mask = _bank()
+    with pytest.raises(NoPose, match="match: features are not finite"):
+        WORDS[0](torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
+    with pytest.raises(NoPose, match="match: query and templates share no feature"):
+        WORDS[0](bank[0].float(), mask[0], bank[:1], mask[:1])  # every word is in the only template

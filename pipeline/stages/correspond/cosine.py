@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from pipeline.errors import NoPose
-from pipeline.functional.camera import cell_to_px, grid_xy
-from pipeline.functional.masks import foreground
 from pipeline.functional.similarity import best_per_group, nearest_of_label, unit
 from pipeline.functional.subpixel import neighbourhood_shift
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences
 from pipeline.spec import Positive, Spec, spec
+from pipeline.stages.correspond import cell_px, cells_in_pairs
 
 
 @spec
@@ -37,8 +34,8 @@ class Cosine(Spec):
 
     def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
         """Matched points, by cluster pair, best first. Raises NoPose when there is none."""
-        query_cell, query_pair = _cells_in_pairs(clusters.query_label, clusters.pairs[:, 0])
-        template_cell, template_pair = _cells_in_pairs(clusters.template_label, clusters.pairs[:, 1])
+        query_cell, query_pair = cells_in_pairs(clusters.query_label, clusters.pairs[:, 0])
+        template_cell, template_pair = cells_in_pairs(clusters.template_label, clusters.pairs[:, 1])
         if len(query_cell) == 0 or len(template_cell) == 0:
             raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
         query = unit(pair.query.float().movedim(0, -1).flatten(0, 1)[query_cell])
@@ -55,26 +52,8 @@ class Cosine(Spec):
         template_kept = template_cell[nearest[kept]]
         shift = neighbourhood_shift(query[kept], template, pair.template_mask, template_kept, kernel=self.kernel)
         return Correspondences(
-            _px(query_cell[kept], torch.zeros_like(shift), like=pair.query, crop_size=crop_size),
-            _px(template_kept, shift, like=pair.template, crop_size=crop_size),
+            cell_px(query_cell[kept], like=pair.query, crop_size=crop_size),
+            cell_px(template_kept, like=pair.template, crop_size=crop_size, shift=shift),
             similarity[kept],
             query_pair[kept],
         )
-
-
-def _cells_in_pairs(
-    label: Int[Tensor, "h w"], paired: Int[Tensor, " p"]
-) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
-    """Flat indices of the cells whose cluster is in a pair, and the index of that pair."""
-    pair_of = torch.full((int(label.max()) + 2,), -1, dtype=torch.int64, device=label.device)
-    pair_of[paired] = torch.arange(len(paired), device=label.device)
-    of_cell = pair_of[label.flatten()]  # background, -1, reads the last entry, which no cluster owns
-    cells = foreground(of_cell >= 0)
-    return cells, of_cell[cells]
-
-
-def _px(
-    cell: Int[Tensor, " m"], shift: Float[Tensor, "m 2"], *, like: Float[Tensor, "d h w"], crop_size: int
-) -> Float[Tensor, "m 2"]:
-    cells = like.shape[-1]
-    return cell_to_px(grid_xy(cell, width=cells) + shift, size=crop_size, cells=cells)

@@ -1,25 +1,77 @@
-"""image, mask or box -> square crop, background removed."""
+"""image, mask or box, K -> square crop, background removed."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.errors import NoPose
+from pipeline.functional.camera import mask_bbox
 from pipeline.spec import Variant
+
+HALF = 0.5 - 1e-5  # half covered in float32 still counts as half
+
+BBox = tuple[float, float, float, float]
 
 
 class Cropper(Variant, Protocol):
-    """What a crop variant is. ``size``: side S of the crop in pixels. The same protocol serves template and query."""
+    """What a crop variant is. ``size``: side S of the crop in pixels. The same protocol serves template and query.
 
+    ``needs_camera``: whether the crop depends on K, which then enters its key.
+    """
+
+    needs_camera: ClassVar[bool]
     size: int
 
     def __call__(
         self,
         rgb: UInt8[np.ndarray, "H W 3"],
         mask: Bool[np.ndarray, "H W"] | None,
-        bbox_xyxy: tuple[float, float, float, float],
+        bbox_xyxy: BBox,
+        K: Float[np.ndarray, "3 3"],
     ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
-        """rgb, mask and A_crop_img; without a mask the box's area is the mask. Raises NoPose for an empty mask."""
+        """rgb, mask and A_crop_img, a homography; without a mask the box's area is the mask.
+
+        Raises NoPose for an empty mask.
+        """
         ...
+
+
+def object_area(
+    mask: Bool[np.ndarray, "H W"] | None, bbox_xyxy: BBox, size_hw: tuple[int, int]
+) -> tuple[Bool[np.ndarray, "H W"], BBox]:
+    """The object's pixels and their box. With a mask, its own box counts, not the given one.
+
+    Raises NoPose for an empty mask, one of another size than the image, and a box without a pixel of the image.
+    """
+    if mask is None:
+        return _box_mask(bbox_xyxy, size_hw), bbox_xyxy
+    if mask.shape != size_hw:
+        raise NoPose("crop", f"mask is {_wide_high(mask.shape)} px, image is {_wide_high(size_hw)} px")
+    box = mask_bbox(mask)
+    if box is None:
+        raise NoPose("crop", "mask is empty, needs 1 pixel")
+    return mask, box
+
+
+def _box_mask(bbox_xyxy: BBox, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose centre is in the box. Raises NoPose when there is none."""
+    x0, y0, x1, y1 = bbox_xyxy
+    if not (np.isfinite(bbox_xyxy).all() and x1 > x0 and y1 > y0):
+        raise NoPose("crop", f"box {text_of(bbox_xyxy)} has no area")
+    x, y = np.arange(size_hw[1]), np.arange(size_hw[0])
+    inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
+    if not inside.any():
+        raise NoPose("crop", f"box {text_of(bbox_xyxy)} holds no pixel of the {size_hw[1]} x {size_hw[0]} image")
+    return inside
+
+
+def text_of(bbox_xyxy: BBox) -> str:
+    """A box for messages."""
+    return "({:g}, {:g}, {:g}, {:g})".format(*bbox_xyxy)
+
+
+def _wide_high(size_hw: tuple[int, ...]) -> str:
+    return f"{size_hw[1]} x {size_hw[0]}"

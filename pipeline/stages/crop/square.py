@@ -8,12 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 
-from pipeline.errors import NoPose
-from pipeline.functional.camera import mask_bbox, square_crop
+from pipeline.functional.camera import square_crop
 from pipeline.functional.resample import resample
 from pipeline.spec import Positive, Spec, spec
-
-_HALF = 0.5 - 1e-5  # half covered in float32 still counts as half
+from pipeline.stages.crop import HALF, BBox, object_area
 
 
 @spec
@@ -27,6 +25,7 @@ class Square(Spec):
 
     kind: ClassVar[str] = "crop.square"
     version: ClassVar[int] = 1
+    needs_camera: ClassVar[bool] = False
 
     size: Positive = 128
     padding_ratio: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.2
@@ -36,39 +35,12 @@ class Square(Spec):
         self,
         rgb: UInt8[np.ndarray, "H W 3"],
         mask: Bool[np.ndarray, "H W"] | None,
-        bbox_xyxy: tuple[float, float, float, float],
+        bbox_xyxy: BBox,
+        K: Float[np.ndarray, "3 3"],
     ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
-        """rgb, mask (at least half of the pixel) and A_crop_img. With a mask, its own box counts, not the given one.
-
-        Raises NoPose for an empty mask, one of another size than the image, and a box without a pixel of the image.
-        """
-        object_mask = _box_mask(bbox_xyxy, rgb.shape[:2]) if mask is None else mask
-        if object_mask.shape != rgb.shape[:2]:
-            raise NoPose("crop", f"mask is {_wide_high(object_mask)} px, image is {_wide_high(rgb)} px")
-        box = bbox_xyxy if mask is None else mask_bbox(object_mask)
-        if box is None:
-            raise NoPose("crop", "mask is empty, needs 1 pixel")
+        """rgb, mask and A_crop_img, a scale and a shift; K plays no part. Raises NoPose as ``object_area`` does."""
+        area, box = object_area(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
         A_crop_img = square_crop(box, size=self.size, padding_ratio=self.padding_ratio)
-        shown = rgb * object_mask[..., None] if self.background == "remove" else rgb
+        shown = rgb * area[..., None] if self.background == "remove" else rgb
         crop = np.rint(resample(shown, A_crop_img, size=self.size)).clip(0, 255).astype(np.uint8)
-        return crop, resample(object_mask, A_crop_img, size=self.size) >= _HALF, A_crop_img
-
-
-def _box_mask(bbox_xyxy: tuple[float, float, float, float], size_hw: tuple[int, ...]) -> Bool[np.ndarray, "H W"]:
-    """Pixels whose centre is in the box. Raises NoPose when there is none."""
-    x0, y0, x1, y1 = bbox_xyxy
-    if not (np.isfinite(bbox_xyxy).all() and x1 > x0 and y1 > y0):
-        raise NoPose("crop", f"box {_text(bbox_xyxy)} has no area")
-    x, y = np.arange(size_hw[1]), np.arange(size_hw[0])
-    inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
-    if not inside.any():
-        raise NoPose("crop", f"box {_text(bbox_xyxy)} holds no pixel of the {size_hw[1]} x {size_hw[0]} image")
-    return inside
-
-
-def _text(bbox_xyxy: tuple[float, float, float, float]) -> str:
-    return "({:g}, {:g}, {:g}, {:g})".format(*bbox_xyxy)
-
-
-def _wide_high(image: np.ndarray) -> str:
-    return f"{image.shape[1]} x {image.shape[0]}"
+        return crop, resample(area, A_crop_img, size=self.size) >= HALF, A_crop_img

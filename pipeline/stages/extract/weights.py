@@ -169,17 +169,11 @@ class DiffusersFolder:
             if (single := folder / f"{stem}{variant}.safetensors").exists():
                 return [single]
             if index.exists():
-                return [index, *self._shards(index)]
-        pickled = sorted(p.name for p in folder.glob("*") if p.suffix in _PICKLES)
+                return [index, *shards(index)]
+        pickled = pickled_in(folder)
         found = f"only {', '.join(pickled)}" if pickled else "no such file"
         needed = "safetensors: convert it (save_pretrained, safe_serialization=True)" if pickled else "the weights"
         raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
-
-    def _shards(self, index: Path) -> list[Path]:
-        weight_map = read_json(index).get("weight_map")
-        if not isinstance(weight_map, dict) or not weight_map:
-            raise BadInput(index, found=f"weight_map {weight_map!r}", needed="the file of each tensor")
-        return sorted({index.parent / str(name) for name in weight_map.values()})
 
     def _empty(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
         return empty_model(cls, self._config(part), dtype, self._json(part))
@@ -187,6 +181,19 @@ class DiffusersFolder:
     def _filled(self, model: nn.Module, part: str) -> nn.Module:
         fill(model, [path for path in self._tensors(part) if path.suffix == ".safetensors"])
         return model
+
+
+def shards(index: Path) -> list[Path]:
+    """The files that an index of sharded weights names. Raises BadInput."""
+    weight_map = read_json(index).get("weight_map")
+    if not isinstance(weight_map, dict) or not weight_map:
+        raise BadInput(index, found=f"weight_map {weight_map!r}", needed="the file of each tensor")
+    return sorted({index.parent / str(name) for name in weight_map.values()})
+
+
+def pickled_in(folder: Path) -> list[str]:
+    """Names of the files that would have to be unpickled."""
+    return sorted(path.name for path in folder.glob("*") if path.suffix in _PICKLES)
 
 
 def check_unet(config: Mapping[str, Any], where: Path) -> None:
@@ -391,19 +398,24 @@ def one_line(error: Exception) -> str:
 
 def _download(hub_id: str, revision: str | None) -> Path:
     """Folder of the hub's files that are needed; the half-precision ones only where there are no others."""
+    for variant in ("", ".fp16"):
+        folder = fetched(hub_id, revision, _patterns(variant))
+        if any((folder / "unet").glob("*.safetensors")):
+            break
+    return folder
+
+
+def fetched(hub_id: str, revision: str | None, patterns: list[str]) -> Path:
+    """Local folder of the hub's files that match ``patterns``. Raises BadInput."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
     try:
-        for variant in ("", ".fp16"):
-            folder = Path(snapshot_download(hub_id, revision=revision, allow_patterns=_patterns(variant)))
-            if any((folder / "unet").glob("*.safetensors")):
-                break
+        return Path(snapshot_download(hub_id, revision=revision, allow_patterns=patterns))
     except (HfHubHTTPError, HFValidationError, OSError) as error:
         found = f"{hub_id!r}, which is no local path and was not fetched: {one_line(error)}"
         needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder"
         raise BadInput(FIELD, found=found, needed=needed) from None
-    return folder
 
 
 def _patterns(variant: str) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +14,7 @@ from pipeline.errors import NoPose
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.items.features import FusedPair
 from pipeline.spec import NonNegative, Variant
+from pipeline.stages.fit import Fit, Fitted
 
 Layers = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 
@@ -31,6 +32,36 @@ class Fuser(Variant, Protocol):
         template_mask: Bool[Tensor, "S S"],
     ) -> FusedPair:
         """Fused maps at the resolution of the finest layer. Raises NoPose when a mask has no cell."""
+        ...
+
+
+@runtime_checkable
+class TrainedFuser(Protocol):
+    """One that was trained on the features of one model."""
+
+    def check(self, model: str) -> None:
+        """Raise BadInput for features of another ``model`` (an extractor's)."""
+        ...
+
+
+@runtime_checkable
+class FittedFuser(Protocol):
+    """A fuser that stands on something fitted to the object's templates."""
+
+    @property
+    def fit(self) -> Fit:
+        """What it stands on."""
+        ...
+
+    def by_fitted(
+        self,
+        query: Mapping[int, Float[Tensor, "c h w"]],
+        template: Mapping[int, Float[Tensor, "c h w"]],
+        query_mask: Bool[Tensor, "S S"],
+        template_mask: Bool[Tensor, "S S"],
+        fitted: Fitted,
+    ) -> FusedPair:
+        """Fused maps. Raises NoPose when a mask has no cell."""
         ...
 
 

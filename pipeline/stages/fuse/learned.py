@@ -18,6 +18,7 @@ from pipeline.items.features import FusedPair
 from pipeline.spec import Spec, spec
 from pipeline.stages.fuse import Layers, fused
 
+LAYERS = (2, 5, 8, 11)
 HEAD = Path(__file__).parents[2] / "embedded" / "weights" / "head.safetensors"
 
 
@@ -31,7 +32,20 @@ class Learned(Spec):
     kind: ClassVar[str] = "fuse.learned"
     version: ClassVar[int] = 1
 
-    layers: Layers = (2, 5, 8, 11)
+    layers: Layers = LAYERS
+
+    @staticmethod
+    def suits(model: str) -> bool:
+        """Whether the head was trained on the features of an extractor's ``model``."""
+        return model.startswith("embedded-learned-")
+
+    def check(self, model: str) -> None:
+        """Raise BadInput for features that the head was not trained on, and for a choice of their layers."""
+        if not self.suits(model):
+            needed = "extract=embedded extract.weights=learned, or fuse=auto or pca for other features"
+            raise BadInput("fuse=learned", found=f"features of {model}", needed=needed)
+        if self.layers != LAYERS:
+            raise BadInput("fuse.layers", found=list(self.layers), needed=f"{list(LAYERS)} for fuse=learned")
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the digest of the head's weights."""
@@ -44,12 +58,8 @@ class Learned(Spec):
         query_mask: Bool[Tensor, "S S"],
         template_mask: Bool[Tensor, "S S"],
     ) -> FusedPair:
-        """Fused maps. Raises NoPose for an empty mask, BadInput for features of another model."""
+        """Fused maps. Raises NoPose for an empty mask."""
         head = _head(query[self.layers[0]].device)
-        found = {layer: int(query[layer].shape[0]) for layer in self.layers}
-        if found != head.channels:
-            needed = f"channels {head.channels} of extract=embedded, or fuse=pca for other features"
-            raise BadInput("fuse=learned", found=f"features of {found} channels", needed=needed)
         with torch.no_grad():
             maps = {layer: torch.stack([query[layer], template[layer]]).float() for layer in self.layers}
             pair = head(maps)
@@ -62,8 +72,7 @@ def _head(device: torch.device) -> Aggregation:
 
     _there()
     state = {name: tensor.float() for name, tensor in load_file(HEAD).items()}
-    layers = (2, 5, 8, 11)
-    channels = {layer: state[f"mix.{k}.weight"].shape[1] for k, layer in enumerate(layers)}
+    channels = {layer: state[f"mix.{k}.weight"].shape[1] for k, layer in enumerate(LAYERS)}
     head = Aggregation(channels, state["narrow.weight"].shape[0])
     head.load_state_dict(state)
     return head.eval().requires_grad_(False).to(device)

@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.errors import NoPose
 from pipeline.items.matches import TemplateMatch
 from pipeline.spec import Variant
+from pipeline.stages.fit import Fit, Fitted
 
 
 class Matcher(Variant, Protocol):
@@ -43,6 +44,22 @@ class TruthMatcher(Protocol):
         T_cam_obj: Float[np.ndarray, "n 4 4"],
     ) -> TemplateMatch:
         """The templates nearest to the true view."""
+        ...
+
+
+@runtime_checkable
+class FittedMatcher(Protocol):
+    """A matcher that stands on something fitted to the object's templates, and needs their features no more."""
+
+    @property
+    def fit(self) -> Fit:
+        """What it stands on."""
+        ...
+
+    def by_fitted(
+        self, query: Float[Tensor, "c h w"], query_mask: Bool[Tensor, "S S"], fitted: Fitted
+    ) -> TemplateMatch:
+        """The best templates of one query. Raises NoPose when nothing can be compared."""
         ...
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,11 +14,18 @@ from pipeline.items.poses import PoseSolution
 from pipeline.spec import Variant
 
 Confidence = Annotated[float, Field(gt=0, lt=1)]
+Plane = Literal["image", "crop"]
 PnpPoints = Annotated[int, Field(ge=4)]  # three points leave up to four poses
 
 
 class Solver(Variant, Protocol):
-    """What a solve variant is."""
+    """What a solve variant is.
+
+    ``plane``: whose pixels and camera it is given, and so whose pixels its threshold means: the full ``image``'s, or
+    the ``crop``'s, where a threshold is the same part of every object, near or far.
+    """
+
+    plane: Plane
 
     def __call__(
         self,
@@ -26,7 +33,7 @@ class Solver(Variant, Protocol):
         px_img: Float[np.ndarray, "m 2"],
         K: Float[np.ndarray, "3 3"],
     ) -> PoseSolution:
-        """T_cam_obj (mm) from full-image pixels. Raises NoPose when no pose is supported by enough inliers."""
+        """T_cam_obj (mm) from pixels of the camera K. Raises NoPose when no pose is supported by enough inliers."""
         ...
 
 

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from pipeline.functional.pnp import pose_of
 from pipeline.items.poses import PoseSolution
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
-from pipeline.stages.solve import Confidence, PnpPoints, solution, usable
+from pipeline.stages.solve import Confidence, Plane, PnpPoints, solution, usable
 
 
 @spec
 class Epnp(Spec):
-    """EPnP (Lepetit et al., IJCV 2009) in RANSAC on full-image pixels, polished on its inliers.
+    """EPnP (Lepetit et al., IJCV 2009) in RANSAC, polished on its inliers.
 
     ``refine``: Levenberg-Marquardt on the inliers, kept only where it lowers the truncated squared error; it also
     mends EPnP's weakness for flat sets of points. ``seed`` shuffles the correspondences: OpenCV's RANSAC draws the same
@@ -24,7 +24,7 @@ class Epnp(Spec):
     """
 
     kind: ClassVar[str] = "solve.epnp"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     iterations: Positive = 400
     threshold_px: PositiveFloat = 8.0
@@ -32,6 +32,7 @@ class Epnp(Spec):
     min_inliers: PnpPoints = 6
     refine: bool = True
     seed: NonNegative = 0
+    plane: Plane = "image"
 
     def __call__(
         self,

@@ -12,19 +12,19 @@ from pipeline.errors import BadInput
 from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.items.poses import PoseSolution
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
-from pipeline.stages.solve import Confidence, PnpPoints, solution, usable
+from pipeline.stages.solve import Confidence, Plane, PnpPoints, solution, usable
 
 
 @spec
 class Poselib(Spec):
-    """P3P in locally optimised RANSAC (Larsson, PoseLib), on full-image pixels.
+    """P3P in locally optimised RANSAC (Larsson, PoseLib).
 
     An optional extra. ``refine``: polished on the inliers as solve=epnp is; PoseLib's own local optimisation always
     runs inside its RANSAC.
     """
 
     kind: ClassVar[str] = "solve.poselib"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     iterations: Positive = 1000
     threshold_px: PositiveFloat = 8.0
@@ -32,6 +32,7 @@ class Poselib(Spec):
     min_inliers: PnpPoints = 6
     refine: bool = True
     seed: NonNegative = 0
+    plane: Plane = "image"
 
     def __post_init__(self) -> None:
         if find_spec("poselib") is None:

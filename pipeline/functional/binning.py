@@ -1,0 +1,36 @@
+"""Context for each cell of a map: the maps around it, near ones sharp, far ones as means."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+
+def bin_count(hierarchy: int) -> int:
+    """Bins of a cell: itself, and 8 around it on every level."""
+    return 1 + 8 * hierarchy
+
+
+def log_binned(maps: Float[Tensor, "n c h w"], *, hierarchy: int) -> Float[Tensor, "n d h w"]:
+    """Each cell beside its spatial bins, d = (1 + 8 ``hierarchy``) c (Amir et al., ECCVW 2022, Sec. 3, and their code).
+
+    Level k holds the means of 3^k x 3^k cells, centred 3^k cells away in the 8 directions; the cell itself comes at
+    level 0 alone. Means leave out what lies beyond the map, and a centre beyond it moves to its border.
+    """
+    bins = []
+    for level in range(hierarchy):
+        step = 3**level
+        means = avg_pool2d(maps, step, stride=1, padding=step // 2, count_include_pad=False)
+        shifts = [(i, j) for i in (-step, 0, step) for j in (-step, 0, step)]
+        bins += [_shifted(means, i, j) for i, j in shifts if level == 0 or (i, j) != (0, 0)]
+    return torch.cat(bins, dim=1)
+
+
+def _shifted(maps: Float[Tensor, "n c h w"], rows: int, columns: int) -> Float[Tensor, "n c h w"]:
+    """The value ``rows`` down and ``columns`` right of each cell, at the border where that is beyond it."""
+    h, w = maps.shape[2:]
+    i = (torch.arange(h, device=maps.device) + rows).clamp(0, h - 1)
+    j = (torch.arange(w, device=maps.device) + columns).clamp(0, w - 1)
+    return maps[:, :, i[:, None], j]

@@ -1,0 +1,84 @@
+"""fused pair, clusters -> corresponding points, in crop pixels: of many mutual neighbours the most salient few."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.errors import NoPose
+from pipeline.functional.kmeans import kmeans
+from pipeline.functional.similarity import nearest_of_label, unit
+from pipeline.items.features import Clusters, FusedPair
+from pipeline.items.matches import Correspondences
+from pipeline.spec import Fraction, NonNegative, Positive, Spec, spec
+from pipeline.stages.correspond import cell_px, cells_in_pairs
+
+
+@spec
+class Salient(Spec):
+    """Mutual nearest neighbours in paired clusters, put in ``count`` groups by k-means; of each group the most salient.
+
+    "Best buddies" of Amir et al., "Deep ViT Features as Dense Visual Descriptors", ECCVW 2022, Sec. 4.4, as ZS6D uses
+    them (Ausserlechner et al., ICRA 2024). A group is of pairs whose descriptors, of query and template side by side,
+    are alike; a pair's saliency is the mean of both sides'. Cells below ``threshold`` are background. Unlike ZS6D's
+    own code k-means is seeded, and points are the cells' centres as numbers, not rounded to pixels.
+    """
+
+    kind: ClassVar[str] = "correspond.salient"
+    version: ClassVar[int] = 1
+    needs_saliency: ClassVar[bool] = True
+
+    count: Positive = 20
+    threshold: Fraction = 0.05
+    seed: NonNegative = 0
+
+    def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
+        """Matched points, most salient first. Raises NoPose when there is none."""
+        query_saliency, template_saliency = (_flat(s) for s in (pair.query_saliency, pair.template_saliency))
+        query_cell, query_pair = self._salient(clusters.query_label, clusters.pairs[:, 0], query_saliency)
+        template_cell, template_pair = self._salient(clusters.template_label, clusters.pairs[:, 1], template_saliency)
+        query = unit(pair.query.float().flatten(1).T[query_cell])
+        template = unit(pair.template.float().flatten(1).T[template_cell])
+        similarity, nearest = nearest_of_label(query, query_pair, template, template_pair)
+        _, back = nearest_of_label(template, template_pair, query, query_pair)
+        buddy = ((back[nearest] == torch.arange(len(query), device=query.device)) & (similarity > 0)).nonzero()[:, 0]
+        if not len(buddy):
+            raise NoPose("correspond", f"no mutual neighbours among {len(query)} and {len(template)} salient cells")
+        other = nearest[buddy]
+        saliency = (query_saliency[query_cell[buddy]] + template_saliency[template_cell[other]]) / 2
+        group, _ = kmeans(
+            torch.cat([query[buddy], template[other]], 1), count=self.count, seed=self.seed, iterations=100
+        )
+        kept = _first_of_each(group, saliency)
+        return Correspondences(
+            cell_px(query_cell[buddy[kept]], like=pair.query, crop_size=crop_size),
+            cell_px(template_cell[other[kept]], like=pair.template, crop_size=crop_size),
+            similarity[buddy[kept]],
+            query_pair[buddy[kept]],
+        )
+
+    def _salient(
+        self, label: Int[Tensor, "h w"], paired: Int[Tensor, " p"], saliency: Float[Tensor, " k"]
+    ) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+        cells, of_pair = cells_in_pairs(label, paired)
+        kept = saliency[cells] > self.threshold
+        if not kept.any():
+            raise NoPose("correspond", f"none of {len(cells)} cells is more salient than {self.threshold:g}")
+        return cells[kept], of_pair[kept]
+
+
+def _flat(saliency: Float[Tensor, "h w"] | None) -> Float[Tensor, " k"]:
+    assert saliency is not None, "the route gives saliency to a SalientCorresponder"
+    return saliency.flatten()
+
+
+def _first_of_each(group: Int[Tensor, " m"], value: Float[Tensor, " m"]) -> Int[Tensor, " k"]:
+    """Index of the highest value of each group, highest of all first; of equals the first."""
+    order = torch.sort(value, descending=True, stable=True).indices
+    first = torch.full((int(group.max()) + 1,), len(group), dtype=torch.int64, device=group.device)
+    rank = torch.arange(len(group), device=group.device)
+    first.scatter_reduce_(0, group[order], rank, "amin")
+    return order[first.sort().values]

@@ -1,0 +1,57 @@
+"""image, mask or box, K -> what a camera that is turned towards the object would see, background removed."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from pydantic import Field
+
+from pipeline.errors import NoPose
+from pipeline.functional.camera import virtual_crop
+from pipeline.functional.resample import warp
+from pipeline.spec import Positive, Spec, spec
+from pipeline.stages.crop import HALF, BBox, object_area, text_of
+
+
+@spec
+class Virtual(Spec):
+    """The picture of a virtual pinhole camera (Örnek et al., "FoundPose", ECCV 2024, section 3.2).
+
+    Its optical axis goes through the centre of the mask's box, or of the given box where there is no mask; its focal
+    length lets the square around the box just fit, whose side is ``padding_ratio`` times the box's longer side. An
+    object at the image's border then looks as a template does, whose camera looks straight at it. Departures from the
+    released code: the axis goes through the box's centre, there through the mean of the rays to its corners; there 1.2
+    is the padding of a sphere through the corners, which is 1.2 sqrt(2) = 1.697 here. ``background``: ``remove``
+    blackens what the mask leaves out before warping; ``keep`` leaves it. Outside the image the crop is black and no
+    mask.
+    """
+
+    kind: ClassVar[str] = "crop.virtual"
+    version: ClassVar[int] = 1
+    needs_camera: ClassVar[bool] = True
+
+    size: Positive = 128
+    padding_ratio: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.2
+    background: Literal["remove", "keep"] = "remove"
+
+    def __call__(
+        self,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        mask: Bool[np.ndarray, "H W"] | None,
+        bbox_xyxy: BBox,
+        K: Float[np.ndarray, "3 3"],
+    ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
+        """rgb, mask and the homography A_crop_img = K_virtual R K^-1.
+
+        Raises NoPose as ``object_area`` does, and for a box that no camera can see as a whole.
+        """
+        area, box = object_area(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
+        try:
+            A_crop_img = virtual_crop(box, K, size=self.size, padding_ratio=self.padding_ratio)
+        except ValueError as reason:
+            raise NoPose("crop", f"box {text_of(box)} with this K: {reason}") from None
+        shown = rgb * area[..., None] if self.background == "remove" else rgb
+        crop = np.rint(warp(shown, A_crop_img, size=self.size)).clip(0, 255).astype(np.uint8)
+        return crop, warp(area, A_crop_img, size=self.size) >= HALF, A_crop_img

@@ -1,0 +1,150 @@
+"""crops -> feature maps of two extractors side by side (Zhang et al., NeurIPS 2023: A Tale of Two Features)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import field
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, Field, PlainValidator
+
+from pipeline.errors import BadInput
+from pipeline.functional.maps import side_by_side
+from pipeline.items.features import FeatureMaps
+from pipeline.items.views import Crops
+from pipeline.spec import Fraction, Runtime, Spec, spec
+from pipeline.stages.extract import Backbone, Extractor
+from pipeline.stages.extract.dinov2 import DinoV2
+from pipeline.stages.extract.stable_diffusion import StableDiffusion
+
+
+def _extractor(value: Any) -> Any:
+    if not all(hasattr(type(value), name) for name in ("feature_shape", "load", "recipe")):
+        raise ValueError("an extract variant, chosen as extract@extract.first=hog")
+    return value
+
+
+def _one_of_each(pairs: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError("each layer of the first extractor once")
+    return pairs
+
+
+Member = Annotated[Extractor, PlainValidator(_extractor)]
+LayerPairs = Annotated[tuple[tuple[int, int], ...], Field(min_length=1), AfterValidator(_one_of_each)]
+
+
+@spec
+class Fusion(Spec):
+    """Two extractors, whatever they are; layer l joins layer l of the first with one of the second.
+
+    ``layers``: the pairs. A cell has both descriptors at length 1, times ``alpha`` and 1 - ``alpha``, on the cells of
+    the first, so that cosines of the whole are means of both cosines, weighted by the squares of the two.
+    """
+
+    kind: ClassVar[str] = "extract.fusion"
+    version: ClassVar[int] = 1
+
+    first: Member = field(default_factory=StableDiffusion)
+    second: Member = field(default_factory=DinoV2)
+    layers: LayerPairs = ((2, 18), (5, 18), (8, 18), (11, 18))
+    alpha: Fraction = 0.5
+
+    @property
+    def needs_geometry(self) -> bool:
+        """Whether either is an oracle."""
+        return self.first.needs_geometry or self.second.needs_geometry
+
+    @property
+    def notice(self) -> str:
+        """What there is to know of either."""
+        return "\n".join(dict.fromkeys(filter(None, [self.first.notice, self.second.notice])))
+
+    @property
+    def model(self) -> str:
+        """Names of both models."""
+        with _told_of("first"):
+            first = self.first.model
+        with _told_of("second"):
+            return f"fusion-{first}-{self.second.model}"
+
+    @property
+    def timestep(self) -> int:
+        """The first's, or the second's where the first has none."""
+        return self.first.timestep or self.second.timestep
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe, with the whole recipes of both."""
+        with _told_of("first"):
+            first = self.first.recipe()
+        with _told_of("second"):
+            second = self.second.recipe()
+        layers = sorted(list(pair) for pair in self.layers)
+        return {
+            "kind": self.kind,
+            "version": self.version,
+            "first": first,
+            "second": second,
+            "layers": layers,
+            "alpha": self.alpha,
+        }
+
+    def feature_shape(self, layer: int) -> tuple[int, int, int]:
+        """(c, h, w). Raises BadInput for a layer that has no pair, or that either extractor does not have."""
+        other = self.partner(layer)
+        with _told_of("first"):
+            channels, h, w = self.first.feature_shape(layer)
+        try:
+            with _told_of("second"):
+                return channels + self.second.feature_shape(other)[0], h, w
+        except BadInput as fault:
+            if not fault.where.endswith(" layer"):
+                raise
+            found = f"layer {other} of the second extractor beside layer {layer}"
+            raise BadInput("extract.layers", found=found, needed=fault.needed) from None
+
+    def partner(self, layer: int) -> int:
+        """The second extractor's layer beside ``layer``. Raises BadInput where there is none."""
+        pairs = dict(self.layers)
+        if layer not in pairs:
+            needed = f"one of {', '.join(map(str, sorted(pairs)))}, as extract.layers pairs them"
+            raise BadInput("extract layer", found=layer, needed=needed)
+        return pairs[layer]
+
+    def load(self, runtime: Runtime) -> FusionBackbone:
+        """Weights of both into memory. Raises BadInput for weights that are missing or of another class."""
+        with _told_of("first"):
+            first = self.first.load(runtime)
+        with _told_of("second"):
+            second = self.second.load(runtime)
+        return FusionBackbone(self, first, second)
+
+
+class FusionBackbone:
+    """A Fusion spec with both extractors in memory."""
+
+    def __init__(self, spec: Fusion, first: Backbone, second: Backbone) -> None:
+        self.spec, self.first, self.second = spec, first, second
+        self.batch = min(first.batch, second.batch)
+
+    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of the given layers, float32."""
+        for layer in layers:
+            self.spec.feature_shape(layer)
+        partner = {layer: self.spec.partner(layer) for layer in layers}
+        first = self.first(crops, tuple(partner))
+        second = self.second(crops, tuple(sorted(set(partner.values()))))
+        return {k: side_by_side(first[k], second[other], alpha=self.spec.alpha) for k, other in partner.items()}
+
+
+@contextmanager
+def _told_of(member: str) -> Iterator[None]:
+    """A fault in a field of one of the two names which: extract.weights becomes extract.first.weights."""
+    try:
+        yield
+    except BadInput as fault:
+        if not fault.where.startswith("extract"):
+            raise
+        where = f"extract.{member}{fault.where.removeprefix('extract')}"
+        raise BadInput(where, found=fault.found, needed=fault.needed) from None

@@ -1,0 +1,152 @@
+"""Weights of a vision transformer as transformers saves them: found, checked, loaded. safetensors only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from pipeline.errors import BadInput
+from pipeline.stages.extract.weights import (
+    FIELD,
+    check_missing,
+    fetched,
+    is_local,
+    pickled_in,
+    quiet_libraries,
+    read_json,
+    shards,
+    tensor_shapes,
+)
+
+CLASSES = {
+    "vit": "ViTModel",
+    "dinov2": "Dinov2Model",
+    "dinov2_with_registers": "Dinov2WithRegistersModel",
+}
+"""model_type of a config -> the class of transformers that has the bare backbone."""
+
+_INDEX, _SINGLE = "model.safetensors.index.json", "model.safetensors"
+_PATTERNS = ["config.json", _INDEX, _SINGLE, "model-[0-9]*-of-[0-9]*.safetensors"]
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """What is known of a transformer before its weights. ``patch``: side in pixels; ``registers``: tokens beside."""
+
+    width: int
+    depth: int
+    heads: int
+    patch: int
+    registers: int
+
+
+def find(weights: str, revision: str | None, model_types: tuple[str, ...]) -> TransformersFolder:
+    """What lies at a hub id or in a local folder. Raises BadInput."""
+    if not is_local(weights):
+        return TransformersFolder(fetched(weights, revision, _PATTERNS), model_types)
+    path = Path(weights).expanduser()
+    if not path.is_dir():
+        found = f"{weights!r}, which is {'a file' if path.exists() else 'not there'}"
+        raise BadInput(FIELD, found=found, needed="a folder as save_pretrained writes it, or a hub id")
+    return TransformersFolder(path, model_types)
+
+
+@dataclass(frozen=True)
+class TransformersFolder:
+    """A folder as transformers' save_pretrained writes it, with a model of one of ``model_types``."""
+
+    root: Path
+    model_types: tuple[str, ...]
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The files whose bytes decide the features, by name."""
+        return {path.name: path for path in (self._json, *self._tensors())}
+
+    def architecture(self) -> Architecture:
+        """Sizes from the config. Raises BadInput for a model of another class."""
+        config = self._config()
+        registers = getattr(config, "num_register_tokens", 0)
+        for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "patch_size", "image_size"):
+            size = getattr(config, name)
+            if not isinstance(size, int) or size < 1:
+                raise BadInput(self._json, found=f"{name} {size!r}", needed="a whole number, 1 or more")
+        return Architecture(
+            config.hidden_size, config.num_hidden_layers, config.num_attention_heads, config.patch_size, registers
+        )
+
+    def model(self, dtype: torch.dtype) -> nn.Module:
+        """The backbone. Raises BadInput for weights that are missing or do not fit the config."""
+        import transformers
+        from safetensors import SafetensorError
+
+        self._config()
+        tensors = [path for path in self._tensors() if path.suffix == ".safetensors"]
+        for path in tensors:
+            tensor_shapes(path)
+        cls: Any = getattr(transformers, CLASSES[self._model_type()])
+        options = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+        options["ignore_mismatched_sizes"] = True  # told below, by name
+        if self._model_type() == "vit":
+            options["add_pooling_layer"] = False
+        try:
+            with quiet_libraries():
+                model, told = cls.from_pretrained(str(self.root), **options)
+        except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
+            raise BadInput(tensors[0], found=_text(error), needed="weights that fit config.json") from None
+        if told["mismatched_keys"]:
+            name, stored, needed = min(told["mismatched_keys"])
+            raise BadInput(
+                f"{tensors[0]}, tensor {name}", found=tuple(stored), needed=f"{tuple(needed)}, as config.json says"
+            )
+        check_missing(sorted(told["missing_keys"]), tensors[0])
+        return model.to(dtype)
+
+    @property
+    def _json(self) -> Path:
+        return self.root / "config.json"
+
+    def _model_type(self) -> str:
+        """Raises BadInput for a config of another class."""
+        needed = f"a {' or '.join(CLASSES[name] for name in self.model_types)} of transformers"
+        if not self._json.exists():
+            seen = sorted(path.name for path in self.root.glob("*") if not path.name.startswith("."))
+            raise BadInput(
+                self._json, found=f"no such file ({', '.join(seen[:8]) or 'an empty folder'})", needed=needed
+            )
+        config = read_json(self._json)
+        model_type, classes = config.get("model_type"), config.get("architectures") or []
+        if model_type not in self.model_types or any(name != CLASSES[model_type] for name in classes):
+            named = ", ".join(map(str, classes)) or config.get("_class_name") or "a config without architectures"
+            raise BadInput(self._json, found=f"{named} (model_type {model_type})", needed=needed)
+        return str(model_type)
+
+    def _config(self) -> Any:
+        import transformers
+
+        cls: Any = getattr(transformers, CLASSES[self._model_type()].removesuffix("Model") + "Config")
+        try:
+            with quiet_libraries():
+                return cls.from_dict(read_json(self._json))
+        except Exception as error:  # what a wrong value raises differs between versions of the library
+            raise BadInput(self._json, found=_text(error), needed=f"the fields of a {cls.__name__}") from None
+
+    def _tensors(self) -> list[Path]:
+        """One file of weights, or an index and its shards."""
+        if (self.root / _SINGLE).exists():
+            return [self.root / _SINGLE]
+        if (self.root / _INDEX).exists():
+            return [self.root / _INDEX, *shards(self.root / _INDEX)]
+        pickled = pickled_in(self.root)
+        found = f"only {', '.join(pickled)}" if pickled else "no such file"
+        needed = "safetensors: convert it (save_pretrained), or name a revision of the hub that has them"
+        raise BadInput(self.root / _SINGLE, found=found, needed=needed if pickled else f"the weights; {needed}")
+
+
+def _text(error: Exception) -> str:
+    """All of an error's text on one line; the first line alone often names no value."""
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,196 @@
+"""crops -> feature maps of a self-supervised vision transformer, whatever its weights.
+
+Amir et al., ECCVW 2022 (Deep ViT Features as Dense Visual Descriptors): what the attention of a block compares, or the
+tokens themselves, as a map of descriptors; patches that overlap for finer maps; bins around each cell for context.
+
+Where a token lies: the crop gets (patch - stride) / 2 black pixels on each side, so that token (i, j) looks at a patch
+centred on cell (i, j) of input_size / stride equal cells that cover the whole crop, as ``camera.cell_to_px`` has it for
+every map. Amir et al. do not pad; their tokens lie half a patch from the border and a stride apart, and a map of equal
+cells would misplace them by up to (patch - stride) / 2 pixels.
+"""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import psutil
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.digests import files_digest
+from pipeline.errors import BadInput
+from pipeline.functional.binning import bin_count, log_binned
+from pipeline.items.features import CLASS_TOKEN_LAYER, SALIENCY_LAYER, FeatureMaps
+from pipeline.items.views import Crops
+from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
+from pipeline.stages.extract.diffusion import network_image
+from pipeline.stages.extract.transformer import Facet, block_tokens, embedded, framed, standardised
+from pipeline.stages.extract.transformers_folder import Architecture, TransformersFolder, find
+
+_CPU_WORKING_BYTES = 1 << 30
+_MOST_CROPS = {"cpu": 16, "cuda": 64}
+_LIVE_MAPS = 24  # maps as wide as the model that are alive at once in a block: projections, attention, its MLP
+
+
+@spec
+class VitFeatures(Spec, ABC):
+    """The parameters that the transformers share. Layers are the numbers of their blocks, from 0.
+
+    ``weights``: a hub id (``revision`` is for it alone) or a folder as save_pretrained writes it; the digest of the
+    files found there stands for both in the recipe. ``stride`` (px of the input, None: the patch size) divides the
+    patch size. Layers in ``binned`` have 1 + 8 ``hierarchy`` spatial bins in a cell (``functional.binning``).
+    ``norm_last``: tokens (not keys, queries or values) pass the model's last layer norm, whichever block they are of.
+    ``saliency_heads``: of the last block, whose attention makes SALIENCY_LAYER (1 h w); None: all.
+    CLASS_TOKEN_LAYER (c 1 1) is the class token behind the last layer norm.
+    """
+
+    needs_geometry: ClassVar[bool] = False
+    notice: ClassVar[str] = ""
+    timestep: ClassVar[int] = 0
+    model_types: ClassVar[tuple[str, ...]]
+
+    weights: str
+    revision: str | None = None
+    facet: Facet = "key"
+    stride: Positive | None = None
+    input_size: Positive = 224
+    binned: tuple[NonNegative, ...] = ()
+    hierarchy: Positive = 2
+    norm_last: bool = False
+    saliency_heads: tuple[NonNegative, ...] | None = None
+    dtype: Dtype = "float32"
+
+    @cached_property
+    def source(self) -> TransformersFolder:
+        """The weights, found (and fetched, for a hub id). Raises BadInput."""
+        return find(self.weights, self.revision, self.model_types)
+
+    @cached_property
+    def architecture(self) -> Architecture:
+        """Sizes from the config alone. Raises BadInput for weights of another class."""
+        return self.source.architecture()
+
+    @cached_property
+    def weights_digest(self) -> str:
+        """sha256 of all files the features depend on. Raises BadInput."""
+        _ = self.architecture  # first: a folder of another class is refused for what it is
+        return files_digest(self.source.files)
+
+    @property
+    def model(self) -> str:
+        """The variant's name and the first 8 digits of the weights' digest."""
+        return f"{self.kind.partition('.')[2]}-{self.weights_digest[:8]}"
+
+    @property
+    def stride_px(self) -> int:
+        """Pixels of the input from one token to the next."""
+        return self.stride or self.architecture.patch
+
+    def recipe(self) -> dict[str, Any]:
+        """As Spec.recipe; the weights by digest, the stride in pixels, and nothing that cannot matter."""
+        recipe = super().recipe() | {"weights": self.weights_digest, "stride": self.stride_px}
+        del recipe["revision"]
+        recipe["hierarchy"] = self.hierarchy if self.binned else 0
+        recipe["binned"] = sorted(set(self.binned))
+        recipe["norm_last"] = self.norm_last and self.facet == "token"
+        return recipe
+
+    def feature_shape(self, layer: int) -> tuple[int, int, int]:
+        """(c, h, w) of one crop's map. Raises BadInput for a layer, stride or input size the model does not have."""
+        _check(self, (layer,))
+        cells, width = self.input_size // self.stride_px, self.architecture.width
+        if layer == CLASS_TOKEN_LAYER:
+            return width, 1, 1
+        if layer == SALIENCY_LAYER:
+            return 1, cells, cells
+        return width * (bin_count(self.hierarchy) if layer in self.binned else 1), cells, cells
+
+    def load(self, runtime: Runtime) -> VitBackbone:
+        """Weights into memory. Raises BadInput for weights that are missing or of another class."""
+        _check(self, ())
+        device = torch.device(runtime.torch_device())
+        model = self.source.model(getattr(torch, self.dtype)).eval().requires_grad_(False).to(device)
+        return VitBackbone(self, model, device, runtime.batch or _fitting_batch(self, device))
+
+
+class VitBackbone:
+    """A VitFeatures spec with its model in memory."""
+
+    def __init__(self, spec: VitFeatures, model: nn.Module, device: torch.device, batch: int) -> None:
+        self.spec, self.model, self.device, self.batch = spec, model, device, batch
+
+    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of the given layers in the spec's dtype, on the model's device; at most ``batch`` crops at a time."""
+        _check(self.spec, layers)
+        chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
+        # concatenated outside inference mode: the maps are ordinary tensors again, free for use in place
+        return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
+
+    @torch.inference_mode()
+    def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        s = self.spec
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            found = block_tokens(
+                self.model,
+                embedded(self.model, self._image(crops), stride=s.stride_px),
+                layers=layers,
+                facet=s.facet,
+                norm_last=s.norm_last,
+                saliency_heads=_heads(s),
+                skipped=1 + s.architecture.registers,
+            )
+            return {layer: self._map(tokens, layer) for layer, tokens in found.items()}
+
+    def _image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
+        """What the patches are cut from: the crops at ``input_size``, framed and standardised."""
+        s = self.spec
+        rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
+        image = (network_image(rgb, size=s.input_size) + 1) / 2
+        framed_image = framed(image, overhang=s.architecture.patch - s.stride_px)
+        return standardised(framed_image).to(getattr(torch, s.dtype))
+
+    def _map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
+        side = 1 if layer == CLASS_TOKEN_LAYER else self.spec.input_size // self.spec.stride_px
+        maps = tokens.transpose(1, 2).unflatten(2, (side, side))
+        return log_binned(maps, hierarchy=self.spec.hierarchy) if layer in self.spec.binned else maps
+
+
+def _heads(spec: VitFeatures) -> Sequence[int]:
+    return range(spec.architecture.heads) if spec.saliency_heads is None else spec.saliency_heads
+
+
+def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
+    a, last = spec.architecture, spec.architecture.depth - 1
+    for layer in layers:
+        if not 0 <= layer <= last and layer not in (SALIENCY_LAYER, CLASS_TOKEN_LAYER):
+            others = f"{SALIENCY_LAYER} (saliency) or {CLASS_TOKEN_LAYER} (class token)"
+            needed = f"0..{last}, the transformer's {a.depth} blocks, {others}"
+            raise BadInput("extract layer", found=layer, needed=needed)
+    if a.patch % spec.stride_px:
+        divisors = ", ".join(str(n) for n in range(1, a.patch + 1) if a.patch % n == 0)
+        raise BadInput("extract.stride", found=spec.stride, needed=f"a divisor of the patch size {a.patch}: {divisors}")
+    if spec.input_size % spec.stride_px:
+        raise BadInput("extract.input_size", found=spec.input_size, needed=f"a multiple of the stride {spec.stride_px}")
+    if strange := [layer for layer in spec.binned if layer > last]:
+        raise BadInput("extract.binned", found=strange[0], needed=f"0..{last}, the transformer's {a.depth} blocks")
+    if SALIENCY_LAYER in layers and (not _heads(spec) or max(_heads(spec)) >= a.heads):
+        found, needed = list(_heads(spec)), f"some of 0..{a.heads - 1}, the {a.heads} heads of the last block"
+        raise BadInput("extract.saliency_heads", found=found, needed=needed)
+
+
+def _fitting_batch(spec: VitFeatures, device: torch.device) -> int:
+    """Crops per pass from free memory, by what is alive within a block and the widest map that is kept."""
+    bytes_per_value = 4 if spec.dtype == "float32" else 2
+    cells = (spec.input_size // spec.stride_px) ** 2
+    maps = _LIVE_MAPS + 2 * len(set(spec.binned)) * bin_count(spec.hierarchy)
+    crop = maps * spec.architecture.width * cells * bytes_per_value
+    if device.type == "cuda":
+        fitting = int(0.6 * torch.cuda.mem_get_info(device)[0]) // crop
+    else:
+        fitting = min(psutil.virtual_memory().available // 4, _CPU_WORKING_BYTES) // crop
+    return max(1, min(fitting, _MOST_CROPS[device.type]))

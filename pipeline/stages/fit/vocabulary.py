@@ -1,0 +1,83 @@
+"""template features, their projection -> visual words of an object, and each template's tf-idf vector."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.functional.kmeans import kmeans
+from pipeline.functional.pca import projected
+from pipeline.functional.similarity import unit
+from pipeline.functional.tfidf import inverse_frequency, nearest_words, soft_weights, word_counts
+from pipeline.items.features import TemplateCells
+from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
+from pipeline.stages.fit import Fit, Fitted
+from pipeline.stages.fit.projection import Projection
+
+
+@spec
+class Vocabulary(Spec):
+    """k-means centres of projected descriptors as words (Örnek et al., "FoundPose", ECCV 2024, section 3.3).
+
+    ``assignments``: nearest words that a descriptor counts for, by equal parts or by ``gaussian`` ones of variance
+    ``sigma_squared``. The centres are those of at most ``samples`` descriptors drawn by ``seed``; words are counted in
+    all. Departure from the released code: a word that is no descriptor's nearest has an idf of ln(n), not of infinity.
+    """
+
+    kind: ClassVar[str] = "fit.vocabulary"
+    version: ClassVar[int] = 1
+
+    projection: Projection
+    count: Positive
+    assignments: Positive
+    weights: Literal["equal", "gaussian"]
+    sigma_squared: PositiveFloat
+    samples: Positive
+    iterations: Positive
+    seed: NonNegative
+
+    @property
+    def layer(self) -> int:
+        """That of the projection."""
+        return self.projection.layer
+
+    @property
+    def base(self) -> Fit | None:
+        """The projection."""
+        return self.projection
+
+    def __call__(self, cells: TemplateCells, base: Fitted) -> dict[str, Tensor]:
+        """``words`` (w d), ``idf`` (w) and unit vectors ``templates`` (n w); w is at most ``count``."""
+        points = projected(cells.features.cpu(), base["mean"], base["axes"])
+        document = cells.template.cpu()
+        _, words = kmeans(self._drawn(points), count=self.count, seed=self.seed, iterations=self.iterations)
+        squared, index = nearest_words(points, words, count=self.assignments)
+        idf = inverse_frequency(index[:, 0], document, documents=cells.templates, words=len(words))
+        return {"words": words, "idf": idf, "templates": self._vectors(squared, index, document, cells.templates, idf)}
+
+    def vector(self, points: Float[Tensor, "m d"], fitted: Fitted) -> Float[Tensor, " w"]:
+        """The unit tf-idf vector of projected descriptors of one view; zero where no word tells templates apart."""
+        squared, index = nearest_words(points, fitted["words"], count=self.assignments)
+        document = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+        return self._vectors(squared, index, document, 1, fitted["idf"])[0]
+
+    def _vectors(
+        self,
+        squared: Float[Tensor, "m k"],
+        index: Int[Tensor, "m k"],
+        document: Int[Tensor, " m"],
+        documents: int,
+        idf: Float[Tensor, " w"],
+    ) -> Float[Tensor, "n w"]:
+        weight = soft_weights(squared, sigma_squared=self.sigma_squared if self.weights == "gaussian" else None)
+        return unit(word_counts(index, weight, document, documents=documents, words=len(idf)) * idf)
+
+    def _drawn(self, points: Float[Tensor, "m d"]) -> Float[Tensor, "s d"]:
+        if len(points) <= self.samples:
+            return points
+        drawn = np.random.default_rng(self.seed).choice(len(points), self.samples, replace=False)
+        return points[torch.from_numpy(np.sort(drawn))]

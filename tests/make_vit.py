@@ -1,0 +1,86 @@
+"""Writes a folder as transformers' save_pretrained does, with seeded random weights: for tests, nothing learned.
+
+Names of tensors and config are those of the hub's checkpoints, whatever the version of transformers that is installed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from pipeline.stages.extract.random_sd import _gaussian
+
+WIDTH, HEADS = 48, 6
+PATCH = {"vit": 8, "dinov2": 14, "dinov2_with_registers": 14}
+CLASS = {"vit": "ViTModel", "dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
+REGISTERS = 4
+
+
+def write_vit(root: Path, model_type: str = "vit", *, depth: int = 12, grid: int = 4, seed: int = 0) -> Path:
+    """``grid``: side of the position embeddings."""
+    root.mkdir(parents=True)
+    (root / "config.json").write_text(json.dumps(config(model_type, depth=depth, grid=grid)))
+    shapes = tensor_shapes(model_type, depth=depth, grid=grid)
+    save_file({name: _drawn(name, shape, seed) for name, shape in shapes.items()}, root / "model.safetensors")
+    return root
+
+
+def config(model_type: str, *, depth: int, grid: int) -> dict[str, Any]:
+    common = {
+        "architectures": [CLASS[model_type]],
+        "model_type": model_type,
+        "hidden_size": WIDTH,
+        "num_hidden_layers": depth,
+        "num_attention_heads": HEADS,
+        "hidden_act": "gelu",
+        "image_size": grid * PATCH[model_type],
+        "patch_size": PATCH[model_type],
+        "num_channels": 3,
+        "qkv_bias": True,
+        "layer_norm_eps": 1e-6,
+    }
+    if model_type == "vit":
+        return common | {"intermediate_size": 2 * WIDTH}
+    return common | {"mlp_ratio": 2} | ({"num_register_tokens": REGISTERS} if "registers" in model_type else {})
+
+
+def tensor_shapes(model_type: str, *, depth: int, grid: int) -> dict[str, tuple[int, ...]]:
+    patch, c = PATCH[model_type], WIDTH
+    shapes: dict[str, tuple[int, ...]] = {
+        "embeddings.cls_token": (1, 1, c),
+        "embeddings.position_embeddings": (1, 1 + grid**2, c),
+        "embeddings.patch_embeddings.projection.weight": (c, 3, patch, patch),
+        "embeddings.patch_embeddings.projection.bias": (c,),
+        "layernorm.weight": (c,),
+        "layernorm.bias": (c,),
+    }
+    if model_type != "vit":
+        shapes["embeddings.mask_token"] = (1, c)
+    if "registers" in model_type:
+        shapes["embeddings.register_tokens"] = (1, REGISTERS, c)
+    norms = ("layernorm_before", "layernorm_after") if model_type == "vit" else ("norm1", "norm2")
+    mlp = ("intermediate.dense", "output.dense") if model_type == "vit" else ("mlp.fc1", "mlp.fc2")
+    for i in range(depth):
+        block = f"encoder.layer.{i}."
+        linear = {f"attention.attention.{facet}": (c, c) for facet in ("query", "key", "value")}
+        linear |= {"attention.output.dense": (c, c), mlp[0]: (2 * c, c), mlp[1]: (c, 2 * c)}
+        for name, shape in linear.items():
+            shapes |= {f"{block}{name}.weight": shape, f"{block}{name}.bias": shape[:1]}
+        for name in norms:
+            shapes |= {f"{block}{name}.weight": (c,), f"{block}{name}.bias": (c,)}
+        if model_type != "vit":
+            shapes |= {f"{block}layer_scale{k}.lambda1": (c,) for k in (1, 2)}
+    return shapes
+
+
+def _drawn(name: str, shape: tuple[int, ...], seed: int) -> torch.Tensor:
+    drawn = _gaussian(name, shape, seed=seed)
+    if name.endswith(("lambda1", "norm.weight", "norm1.weight", "norm2.weight", "before.weight", "after.weight")):
+        return 1 + 0.1 * drawn
+    # matrices keep the size of activations; attention that differs from patch to patch has scores beyond 1
+    return drawn * 2 / math.prod(shape[1:]) ** 0.5 if len(shape) > 1 and name.endswith("weight") else 0.3 * drawn

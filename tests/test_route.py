@@ -1,0 +1,77 @@
+"""The route's geometry: poses in the plane of a crop, and from a template alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.functional import camera, rigid
+from pipeline.route import Query, Stages, TemplateView, _solved, template_pose
+from pipeline.stages.solve.epnp import Epnp
+from pipeline.stages.solve.poselib import Poselib
+
+K = np.array([[600.0, 0.0, 310.0], [0.0, 580.0, 250.0], [0.0, 0.0, 1.0]])
+T = rigid.rigid(rigid.look_at(np.array([300.0, 200.0, 250.0]))[:3, :3], np.array([250.0, -120.0, 700.0]))
+BOX = (480.0, 90.0, 580.0, 200.0)
+MASK = torch.ones(8, 8, dtype=torch.bool)
+CROPS = {
+    "square": camera.square_crop(BOX, size=128, padding_ratio=1.2),
+    "virtual": camera.virtual_crop(BOX, K, size=128, padding_ratio=1.2),
+}
+
+
+def solved(solve: Epnp | Poselib, A_crop_img: np.ndarray, *, noise_px: float = 0.0):
+    points = np.random.default_rng(0).uniform(-60, 60, (80, 3))
+    px = camera.project(K, rigid.transform(T, points)) + noise_px * np.random.default_rng(1).normal(size=(80, 2))
+    seen = np.ones(80, bool)
+    seen[::9] = False
+    stages = Stages(
+        **dict.fromkeys(("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "detect")), solve=solve
+    )
+    return _solved(stages, Query({}, MASK, A_crop_img, K), points, px, seen), seen, points, px
+
+
+@pytest.mark.parametrize("crop", CROPS)
+@pytest.mark.parametrize("plane", ["image", "crop"])
+@pytest.mark.parametrize("solver", [Epnp, Poselib])
+def test_exact_projections_give_the_exact_pose_in_either_plane(crop, plane, solver):
+    solution, seen, _, _ = solved(solver(plane=plane), CROPS[crop])
+    np.testing.assert_allclose(solution.T_cam_obj, T, atol=1e-5)  # mm, converged from another start
+    assert np.array_equal(solution.inliers, seen)
+
+
+def test_a_threshold_in_the_crop_is_of_crop_pixels_and_the_error_of_image_pixels():
+    A = CROPS["square"]  # about one crop pixel per image pixel
+    in_crop, _, points, px = solved(Epnp(plane="crop", threshold_px=2 * A[0, 0]), A, noise_px=1.0)
+    in_image, *_ = solved(Epnp(threshold_px=2.0), A, noise_px=1.0)
+    assert np.array_equal(in_crop.inliers, in_image.inliers)
+    np.testing.assert_allclose(in_crop.T_cam_obj, in_image.T_cam_obj, atol=1e-3)
+    error = camera.project(K, rigid.transform(in_crop.T_cam_obj, points)) - px
+    rms = np.sqrt((error[in_crop.inliers] ** 2).sum(1).mean())
+    assert in_crop.reprojection_px == pytest.approx(rms)
+    assert in_image.reprojection_px == pytest.approx(rms, abs=1e-3)
+
+
+def view(A_crop_img: np.ndarray, T_cam_obj: np.ndarray) -> TemplateView:
+    return TemplateView({}, MASK, A_crop_img, np.zeros((4, 4)), K, T_cam_obj)
+
+
+def test_a_template_that_looks_the_same_in_a_turned_camera_gives_the_turned_pose():
+    T_template = rigid.rigid(T[:3, :3], np.array([0.0, 0.0, 700.0]))
+    K_virtual = np.array([[900.0, 0.0, 63.5], [0.0, 900.0, 63.5], [0.0, 0.0, 1.0]])
+    turn = rigid.rotation_between(np.array([0.0, 0, 1]), np.array([0.4, -0.2, 1.0]))
+    A_query, A_template = K_virtual @ turn.T @ np.linalg.inv(K), K_virtual @ np.linalg.inv(K)
+    found = template_pose(Query({}, MASK, A_query, K), view(A_template, T_template))
+    expected = rigid.rigid(turn @ T_template[:3, :3], turn @ T_template[:3, 3])
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_template_in_a_square_crop_keeps_its_place_and_its_size():
+    T_template = rigid.rigid(T[:3, :3], np.array([3.0, -5.0, 700.0]))
+    A_template = camera.square_crop((250.0, 200.0, 370.0, 300.0), size=128, padding_ratio=1.2)
+    found = template_pose(Query({}, MASK, CROPS["square"], K), view(A_template, T_template))
+    at = [
+        camera.apply(A, camera.project(K, pose[:3, 3]))
+        for A, pose in ((A_template, T_template), (CROPS["square"], found))
+    ]
+    np.testing.assert_allclose(*at, atol=1e-9)
+    assert found[2, 3] == pytest.approx(700 * CROPS["square"][0, 0] / A_template[0, 0])
