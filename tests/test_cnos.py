@@ -35,6 +35,7 @@ from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.extract.hog import Hog
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.match.cosine import Cosine
+from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
@@ -141,6 +142,7 @@ def graph_of(scene: Path, cache: Path, *, extract: Any = None, **changes: Any) -
         cluster=One(),
         correspond=Corresponder(),
         solve=Epnp(),
+        refine=NoRefinement(),
         detect=changes.pop("detect", None) or Cnos(**{**fields, **changes}),
     )
     data, store = open_dataset(scene, name="toy"), Store(LocalStoreConfig(root=str(cache)))

@@ -84,14 +84,15 @@ class Plan:
             if n
         ]
 
+    def _of_description(self, described: ProposalNodes, obj_id: int) -> Node:
+        n = len(self.run.stages.render.cameras(self.run.model(obj_id).mesh)[1])
+        size = _size(described.run.features_layout(described.detector.describe_layer), n)
+        ref, of = described.template_features(obj_id), f"object {obj_id}, to be detected by"
+        return self._node("template features", of, ref, size, f"{n} images through the backbone")
+
     def _of_proposals(self, described: ProposalNodes) -> list[Node]:
         """What detections are computed from, and they themselves."""
-        nodes = [
-            self._node(
-                "template features", f"object {obj_id} for detections", described.template_features(obj_id), 0, ""
-            )
-            for obj_id in self.run.object_ids
-        ]
+        nodes = [self._of_description(described, obj_id) for obj_id in self.run.object_ids]
         for image in self.run.image_ids:
             of = f"scene {image[0]} image {image[1]}"
             nodes.append(self._node("proposals", of, described.proposals(image), 0, "1 image through the proposer"))
