@@ -1,5 +1,7 @@
 """The route's geometry: poses in the plane of a crop, and from a template alone."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -24,9 +26,8 @@ def solved(solve: Epnp | Poselib, A_crop_img: np.ndarray, *, noise_px: float = 0
     px = camera.project(K, rigid.transform(T, points)) + noise_px * np.random.default_rng(1).normal(size=(80, 2))
     seen = np.ones(80, bool)
     seen[::9] = False
-    stages = Stages(
-        **dict.fromkeys(("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "detect")), solve=solve
-    )
+    others = dict.fromkeys(field.name for field in fields(Stages) if field.name not in ("solve", "fallback"))
+    stages = Stages(**others, solve=solve)
     return _solved(stages, Query({}, MASK, A_crop_img, K), points, px, seen), seen, points, px
 
 
