@@ -218,11 +218,11 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
     mask = run_dzop(capsys, monkeypatch, *given, f"dataset.mask={frame}/mask_visib/000000_000000.png")
     assert mask.status == 0, mask.err
     assert "1 poses, 0 without" in mask.out or "0 poses, 1 without" in mask.out
-    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*/overlays/*.jpg"))) == 1
+    assert len(list(tmp_path.glob("results/dzop-x-hog_photo-test/*/overlays/*.jpg"))) == 1
     box = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,60]")
     other = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,70]")
     assert box.status == other.status == 0
-    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*"))) == 3  # another box is another run
+    assert len(list(tmp_path.glob("results/dzop-x-hog_photo-test/*"))) == 3  # another box is another run
 
 
 @pytest.mark.parametrize(

@@ -203,4 +203,5 @@ def test_yaml_lists_every_field_with_its_default():
     values = yaml.safe_load(path.read_text())
     assert values.pop("_target_") == f"{Sam.__module__}.{Sam.__name__}"
     assert set(values) == {field.name for field in fields(Sam)}
+    values["weights"] = yaml.safe_load((path.parents[2] / "config.yaml").read_text())["weights"]["sam"]
     assert build(Sam, values, where="detect.proposals") == Sam()

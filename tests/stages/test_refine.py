@@ -52,7 +52,7 @@ def view(mesh, K, T_cam_obj, size_hw, rng, hidden):
     mask, (y, x), angle = depth_mm > 0, np.mgrid[: size_hw[0], : size_hw[1]], rng.uniform(0, 2 * np.pi)
     along = np.cos(angle) * x + np.sin(angle) * y
     mask &= along <= np.quantile(along[mask], 1 - hidden)
-    crop, mask, A_crop_img = CROP(np.zeros((*size_hw, 3), np.uint8), mask, camera.mask_bbox(mask))
+    crop, mask, A_crop_img = CROP(np.zeros((*size_hw, 3), np.uint8), mask, camera.mask_bbox(mask), K)
     crops = Crops(crop[None], mask[None], A_crop_img[None], Geometry([depth_mm], K[None], T_cam_obj[None]))
     maps = Coordinates().load(Runtime(device="cpu"))(crops, [11])
     return {11: maps[11][0]}, torch.from_numpy(mask), A_crop_img, depth_mm
