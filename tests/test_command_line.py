@@ -213,16 +213,16 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
     K = json.loads((frame / "scene_camera.json").read_text())["0"]["cam_K"]
     given = (
         "dataset=photo", f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={frame}/rgb/000000.png",
-        f"dataset.K=[{K[0]},{K[4]},{K[2]},{K[5]}]", *SMALL[:3], "overlays=true", "runtime.progress=false",
+        f"dataset.K=[{K[0]},{K[4]},{K[2]},{K[5]}]", *SMALL[:4], "overlays=true", "runtime.progress=false",
     )  # fmt: skip
     mask = run_dzop(capsys, monkeypatch, *given, f"dataset.mask={frame}/mask_visib/000000_000000.png")
     assert mask.status == 0, mask.err
     assert "1 poses, 0 without" in mask.out or "0 poses, 1 without" in mask.out
-    assert len(list(tmp_path.glob("results/dzop-x-hog_photo-test/*/overlays/*.jpg"))) == 1
+    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*/overlays/*.jpg"))) == 1
     box = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,60]")
     other = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,70]")
     assert box.status == other.status == 0
-    assert len(list(tmp_path.glob("results/dzop-x-hog_photo-test/*"))) == 3  # another box is another run
+    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*"))) == 3  # another box is another run
 
 
 @pytest.mark.parametrize(
