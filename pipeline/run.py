@@ -213,6 +213,9 @@ def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float)
     print(f"\n{len(answers) - len(missing)} poses, {len(missing)} without (each with its reason)")
     if judged is not None:
         print(scores_table(judged.scored, theta_max=theta_max))
+        if judged.correspondences:
+            error = np.median(list(judged.correspondences.values()))
+            print(f"correspondences: median {error:.1%} of the diameter off, parallel to the image")
 
 
 def _use_threads(threads: int) -> None:

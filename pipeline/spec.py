@@ -102,10 +102,19 @@ def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
         if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
             known = ", ".join(f.name for f in fields(cls))  # type: ignore[arg-type]
             raise BadInput(field, found="an unknown field", needed=f"one of: {known}") from None
+        if first["type"] in ("too_long", "too_short"):
+            least_or_most = "at most" if first["type"] == "too_long" else "at least"
+            count = first["ctx"].get("max_length", first["ctx"].get("min_length"))
+            needed = f"{least_or_most} {count} value{'' if count == 1 else 's'}"
+            raise BadInput(field, found=_shown(first["input"]), needed=needed) from None
         message = first["msg"].removeprefix("Value error, ")
         needed = message[0].lower() + message[1:].removeprefix("nput should be ")
         needed = needed.removeprefix("i") if message.startswith("Input should be ") else needed
         raise BadInput(field, found=repr(first["input"]), needed=needed) from None
+
+
+def _shown(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _tuples(value: Any) -> Any:

@@ -8,7 +8,7 @@ It prints the overrides that name them; what is there already is kept.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 from make_sam import write_sam
@@ -31,4 +31,6 @@ def write_weights(root: Path) -> list[str]:
 
 
 if __name__ == "__main__":
-    print(*write_weights(Path(sys.argv[1]).resolve()))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    print(*write_weights(parser.parse_args().folder.resolve()))

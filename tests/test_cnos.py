@@ -376,3 +376,9 @@ def test_a_photograph_without_mask_or_box_is_told_of_cnos(photo):
     assert ran.status == 1
     assert "neither of mask and bbox" in ran.err
     assert "detect=cnos" in ran.err
+
+
+def test_a_mask_beside_a_detector_that_finds_objects_itself_is_refused(photo):
+    ran = photo("dataset.bbox=[10,10,40,40]")
+    assert ran.status == 1
+    assert "dataset.bbox: found with detect.cnos, needs detect=photo, or no mask and no box" in ran.err

@@ -4,6 +4,7 @@ import pytest
 
 from pipeline.errors import BadInput
 from pipeline.spec import NonNegative, Positive, Spec, build, canonical, digest, spec
+from pipeline.stages.fuse.template_pca import TemplatePca
 
 
 @spec
@@ -79,3 +80,10 @@ def test_a_wrong_field_is_told_in_one_line(values: dict, message: str):
 def test_a_missing_field_is_named():
     with pytest.raises(BadInput, match=r"outer\.first"):
         build(Outer, {}, where="outer")
+
+
+def test_too_many_and_too_few_values_are_counted():
+    with pytest.raises(BadInput, match=r"fuse.layers: found \[2, 5\], needs at most 1 value$"):
+        build(TemplatePca, {"layers": [2, 5]}, where="fuse")
+    with pytest.raises(BadInput, match=r"fuse.layers: found \[\], needs at least 1 value$"):
+        build(TemplatePca, {"layers": []}, where="fuse")

@@ -70,6 +70,11 @@ class Dataset:
         return tuple(sorted({(target.scene_id, target.im_id) for target in self.targets}))
 
     @property
+    def told_where(self) -> str:
+        """The field by which a user said where the object is, "" where nothing did."""
+        return ""
+
+    @property
     def given_bbox_xyxy(self) -> Box | None:
         """A box that came with the dataset's settings instead of a file; it enters the keys of detections."""
         return None

@@ -110,6 +110,11 @@ class Photo(Dataset):
     scale: float = 1.0
 
     @property
+    def told_where(self) -> str:
+        """As Dataset.told_where."""
+        return "dataset.mask" if self.mask_file else "dataset.bbox" if self.bbox_xyxy else ""
+
+    @property
     def given_bbox_xyxy(self) -> Box | None:
         """The box, when there is one instead of a mask."""
         return self.bbox_xyxy

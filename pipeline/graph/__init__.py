@@ -56,13 +56,15 @@ class Graph:
             try:
                 stages.extract.feature_shape(layer)
             except BadInput as fault:
-                if layer == SALIENCY_LAYER:
+                if layer == SALIENCY_LAYER and "layer" in fault.where:
                     found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
                     raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
                 if "layer" in fault.where:
                     raise BadInput(asked[layer], found=fault.found, needed=fault.needed) from None
                 raise
         if self.detections.proposals:
+            if where := self.run.dataset.told_where:
+                raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
             self.detections.proposals.check()
 
     def onboard(self) -> None:

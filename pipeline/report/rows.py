@@ -16,7 +16,8 @@ from pipeline.whole import write_json
 FORMAT = 1
 FOLDER = "rows"
 # none of these changes an answer or a score
-UNTOLD = ("step", "plan", "out", "overlays", "gallery", "threads", "runtime", "store", "hydra", "sweep", "report")
+UNTOLD = ("step", "plan", "out", "overlays", "gallery", "threads", "runtime", "store", "hydra", "sweep", "report",
+          "weights")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -205,3 +205,10 @@ def test_yaml_lists_every_field_with_its_default():
     assert set(values) == {field.name for field in fields(Sam)}
     values["weights"] = yaml.safe_load((path.parents[2] / "config.yaml").read_text())["weights"]["sam"]
     assert build(Sam, values, where="detect.proposals") == Sam()
+
+
+def test_points_whose_masks_are_all_unsure_propose_nothing(folder: Path):
+    every = [p.confidence for p in proposed(folder)]
+    sure = [p.confidence for p in proposed(folder, batch=1, min_iou=1.0)]  # random weights predict any IoU
+    assert sure == pytest.approx([c for c in every if c > 1.0], abs=1e-4)
+    assert len(sure) < len(every)

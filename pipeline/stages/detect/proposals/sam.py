@@ -114,6 +114,8 @@ class SamProposing:
     ) -> Iterator[tuple[Bool[np.ndarray, "H W"], float]]:
         """Masks of the image's size that pass both thresholds, with their predicted IoU."""
         chosen = iou > self.spec.min_iou
+        if not chosen.any():
+            return  # none of these points
         at_once = max(1, _BLOCK // max(self.side**2, size_hw[0] * size_hw[1]))
         for small, confidence in zip(logits[chosen].split(at_once), iou[chosen].split(at_once), strict=True):
             large = self.enlarged(small, size_hw)
