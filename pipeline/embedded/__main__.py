@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Shards first as far as the first steps need them, then each stage to its end."""
+    """Shards first as far as the first steps need them, then each stage; weights are replaced once all have ended."""
     if options.threads:
         torch.set_num_threads(options.threads)
     until, place, plan = time.time() + 60 * options.minutes, Place(options.folder), Plan()
@@ -34,8 +34,8 @@ def run(options: argparse.Namespace) -> None:
         make_shard(place.folder / "shards", index)
     for kind, steps in ((Autoencoder, plan.autoencoder), (Denoiser, plan.denoiser), (Descriptors, plan.descriptors)):
         if not train(kind(plan, place, round(steps * options.scale)), place, until=until):
-            print(f"{kind.name}: time is up; the next call goes on from here")
-            break
+            print(f"{kind.name}: time is up; the next call goes on from here, {WEIGHTS} stays as it is")
+            return
         print(f"{kind.name}: done")
     print(f"{export(place, WEIGHTS) / 1e6:.1f} MB of weights in {WEIGHTS}")
 
