@@ -120,5 +120,5 @@ def test_options_that_cannot_be_name_what_is_needed():
         BadInput, match=r"fuse.dim: found 3, needs at least 4, one for each layer, where dim_mode is total"
     ):
         build(Pca, {"dim": 3}, where="fuse")
-    with pytest.raises(BadInput, match=r"fuse.layers: found \(\), needs "):
+    with pytest.raises(BadInput, match=r"fuse.layers: found \[\], needs at least 1 value"):
         build(Pca, {"layers": []}, where="fuse")

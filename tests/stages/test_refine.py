@@ -185,5 +185,5 @@ def test_cells_beyond_max_points_are_drawn_by_the_seed():
 def test_options_out_of_range_name_the_field():
     with pytest.raises(BadInput, match=r"refine.sigmas_cells.0: found -1.0, needs greater than or equal to 0"):
         build(Featuremetric, {"sigmas_cells": [-1.0]}, where="refine")
-    with pytest.raises(BadInput, match=r"refine.sigmas_cells: found \(\), needs"):
+    with pytest.raises(BadInput, match=r"refine.sigmas_cells: found \[\], needs at least 1 value"):
         build(Featuremetric, {"sigmas_cells": []}, where="refine")
