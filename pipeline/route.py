@@ -2,7 +2,7 @@
 
 mesh -render-> templates -crop, extract-> template features -fit->     (offline, once for every object)
 image -detect, crop, extract-> query features                          (once for every image)
-query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve, refine-> pose
+query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> hypotheses -select, refine-> pose
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from pipeline.stages.lift import lift
 from pipeline.stages.match import FittedMatcher, Matcher, TruthMatcher
 from pipeline.stages.refine import Refiner
 from pipeline.stages.render import Renderer
+from pipeline.stages.select import Selector
 from pipeline.stages.solve import Solver
 
 MIN_POINTS = 4
@@ -54,6 +55,7 @@ class Stages:
     cluster: Clusterer
     correspond: Corresponder
     solve: Solver
+    select: Selector
     refine: Refiner
     detect: Detector | DescribingDetector
     fallback: bool = False
@@ -138,7 +140,7 @@ class TemplateBank(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one template led to; ``solution`` None with the ``failure`` that stopped it."""
+    """What one template led to; ``solution`` None with the ``failure`` that stopped it. ``worth``: select's."""
 
     template_id: int
     template_score: float
@@ -148,6 +150,7 @@ class Hypothesis:
     points_obj: Float[np.ndarray, "m 3"] | None = None
     query_px_img: Float[np.ndarray, "m 2"] | None = None
     solution: PoseSolution | None = None
+    worth: float = -1.0
     failure: NoPose | None = None
 
     @property
@@ -172,7 +175,7 @@ class Trace:
 
     @property
     def best(self) -> Hypothesis:
-        """Most inliers; of equals the better template. Nothing here sees ground truth."""
+        """The worthiest; of equals the better template. Nothing here sees ground truth."""
         return self.hypotheses[0]
 
 
@@ -199,7 +202,7 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
         match = _match(stages, query, bank)
     ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
     hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
-    hypotheses.sort(key=lambda h: -h.inliers)  # stable: equals stay in the order of their templates
+    hypotheses.sort(key=lambda h: -h.worth)  # stable: equals stay in the order of their templates
     hypotheses[0] = _refined(stages, query, bank, hypotheses[0], clock)
     return Trace(match, tuple(hypotheses), clock.times_s)
 
@@ -234,7 +237,10 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
             seen = np.isfinite(points_obj).all(1)
             if seen.sum() < MIN_POINTS:
                 raise NoPose("lift", f"{seen.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
-            parts["solution"] = _solved(stages, query, points_obj, query_px_img, seen)
+            solution = _solved(stages, query, points_obj, query_px_img, seen)
+            parts["solution"] = solution
+        with clock("select"):
+            parts["worth"] = _worth(stages, query, template, pair, solution)
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
@@ -277,6 +283,13 @@ def _template_cells(
     template_px = camera.cell_to_px(cell_xy.double(), size=stages.crop.size, cells=cells)
     px = template_px.cpu().numpy()
     return template_px, lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
+
+
+def _worth(stages: Stages, query: Query, template: TemplateView, pair: FusedPair, solution: PoseSolution) -> float:
+    """What select makes of a solved hypothesis."""
+    _, points_obj = _template_cells(stages, template, pair)
+    inliers, K_crop = int(solution.inliers.sum()), query.A_crop_img @ query.K
+    return stages.select(solution.T_cam_obj, inliers, pair, points_obj, K_crop, crop_size=stages.crop.size)
 
 
 def _refined(stages: Stages, query: Query, bank: TemplateBank, best: Hypothesis, clock: Clock) -> Hypothesis:

@@ -37,6 +37,7 @@ from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
+from pipeline.stages.select.inliers import Inliers
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
@@ -142,6 +143,7 @@ def graph_of(scene: Path, cache: Path, *, extract: Any = None, **changes: Any) -
         cluster=One(),
         correspond=Corresponder(),
         solve=Epnp(),
+        select=Inliers(),
         refine=NoRefinement(),
         detect=changes.pop("detect", None) or Cnos(**{**fields, **changes}),
     )

@@ -28,6 +28,7 @@ from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.words import Words
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
+from pipeline.stages.select.inliers import Inliers
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.objects import make_object
@@ -42,6 +43,7 @@ FULL = Stages(
     cluster=KMeans(),
     correspond=Corresponder(),
     solve=Epnp(),
+    select=Inliers(),
     refine=NoRefinement(),
     detect=GtMask(),
 )

@@ -26,6 +26,7 @@ from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.oracle import Oracle
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
+from pipeline.stages.select.inliers import Inliers
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
@@ -39,6 +40,7 @@ PLAIN = Stages(
     cluster=One(),
     correspond=Corresponder(),
     solve=Epnp(),
+    select=Inliers(),
     refine=NoRefinement(),
     detect=GtMask(),
 )

@@ -138,6 +138,12 @@ def summary(name: str) -> list[float]:
     if stage == "solve":
         solution = spec(*toy_points())
         return [float(solution.inliers.sum()), *solution.T_cam_obj[:3].round(4).flatten().tolist()]
+    if stage == "select":
+        pair = toy_pair()
+        x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
+        points, K_crop = np.stack([x, y, 0 * x], axis=1), np.array([[-400.0, 0, 31.5], [0, 400.0, 31.5], [0, 0, 1]])
+        poses = [rigid.rigid(np.eye(3), np.array([shift, 0.0, 400.0])) for shift in (0.0, 3.0, 9.0)]
+        return [spec(T, 25, pair, points, K_crop, crop_size=64) for T in poses]
     if stage == "refine":
         pair = toy_pair()
         x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T

@@ -17,8 +17,8 @@ from pipeline.route import Query, Trace, Truth, template_pose, trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
-POSES_VERSION = 1
-ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "refine")
+POSES_VERSION = 2
+ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "select", "refine")
 
 
 @dataclass(eq=False)

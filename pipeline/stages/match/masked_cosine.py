@@ -29,7 +29,7 @@ class MaskedCosine(Spec):
     version: ClassVar[int] = 1
 
     layer: NonNegative = 8
-    top_k: Positive = 5
+    top_k: Positive = 15
     normalise: Literal["intersection", "query", "union"] = "union"
 
     def __call__(

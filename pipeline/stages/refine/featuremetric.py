@@ -12,12 +12,10 @@ from torch import Tensor
 from pipeline.functional.camera import cell_affine
 from pipeline.functional.featuremetric import Robust, descend, level, normal_equations, robust_scale, unit
 from pipeline.items.features import FusedPair
-from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
+from pipeline.spec import NonNegative, NonNegativeFloat, Positive, PositiveFloat, Spec, spec
 
 ALPHA = {"barron": -5.0, "cauchy": 0.0, "geman_mcclure": -2.0}
 MIN_POINTS = 6
-
-Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @spec
@@ -41,7 +39,7 @@ class Featuremetric(Spec):
 
     loss: Literal["barron", "cauchy", "geman_mcclure"] = "geman_mcclure"
     scale: PositiveFloat = 1.0
-    sigmas_cells: Annotated[tuple[Sigma, ...], Field(min_length=1)] = (2.0, 1.0, 0.0)
+    sigmas_cells: Annotated[tuple[NonNegativeFloat, ...], Field(min_length=1)] = (2.0, 1.0, 0.0)
     iterations: Positive = 30
     normalise: bool = True
     max_points: Positive = 1000
