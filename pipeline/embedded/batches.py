@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from pipeline.embedded.dressing import dressed
 from pipeline.embedded.pictures import Picture, View, photograph, template
 from pipeline.embedded.views import (
     CLUSTERS_PER_OBJECT,
@@ -52,7 +53,7 @@ class Source:
             views = _shard(self.folder, int(rng.integers(known)), self.validation)
             first = CLUSTERS_PER_OBJECT * int(rng.integers(len(views) // CLUSTERS_PER_OBJECT))
             clusters = range(first, first + CLUSTERS_PER_OBJECT)
-            found.append([[_unpacked(views, k, v) for v in range(VIEWS)] for k in clusters])
+            found.append(dressed([[_unpacked(views, k, v) for v in range(VIEWS)] for k in clusters], rng))
         return found, rng
 
 
@@ -76,7 +77,10 @@ def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n 
     """Pictures of all sorts, each of another object: two in three are photographs."""
     objects, rng = source.objects(step, count)
     views = [clusters[int(rng.integers(len(clusters)))][int(rng.integers(VIEWS))] for clusters in objects]
-    made = [photograph(v, rng) if rng.uniform() < 0.67 else template(v, rng) for v in views]
+    made = [
+        photograph(view, rng, other=other) if rng.uniform() < 0.67 else template(view, rng)
+        for view, other in zip(views, views[1:] + views[:1], strict=True)
+    ]
     return torch.from_numpy(np.stack([p.rgb for p in made]))
 
 
@@ -85,9 +89,9 @@ def pair_batch(source: Source, step: int, *, count: int) -> PairBatch:
     objects, rng = source.objects(step, count)
     pictures: list[Picture] = []
     parts, angles = [], []
-    for clusters in objects:
+    for clusters, others in zip(objects, objects[1:] + objects[:1], strict=True):
         for views in clusters:
-            queries = [photograph(views[0], rng) for _ in range(QUERIES)]
+            queries = [photograph(views[0], rng, other=_any(others, rng)) for _ in range(QUERIES)]
             pictures += queries + [template(view, rng) for view in views[1:]]
             parts += [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
         R_template = _rotations([view for views in clusters for view in views[1:]])
@@ -104,6 +108,11 @@ def pair_batch(source: Source, step: int, *, count: int) -> PairBatch:
         ok.reshape(shape),
         torch.from_numpy(np.stack(angles).astype(np.float32)).reshape(*shape[:3], -1),
     )
+
+
+def _any(clusters: list[list[View]], rng: Rng) -> View:
+    views = clusters[int(rng.integers(len(clusters)))]
+    return views[int(rng.integers(len(views)))]
 
 
 def _rotations(views: list[View]) -> Float[np.ndarray, "n 3 3"]:

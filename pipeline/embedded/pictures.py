@@ -53,16 +53,21 @@ def template(view: View, rng: Rng) -> Picture:
     return Picture(rgb, view.mask, view.mask, np.eye(3))
 
 
-def photograph(view: View, rng: Rng) -> Picture:
+def photograph(view: View, rng: Rng, *, other: View) -> Picture:
     """Another light, camera and crop; hidden in part, small, blurred, noisy, its mask not quite right.
 
     How bad it is varies from nearly perfect to hardly legible: what can be placed exactly has to be placed exactly.
+    ``other`` shows an object that may stand before this one.
     """
     rough = float(rng.uniform())
     colour, ground = _relit(view, rng), _ground(rng)
-    seen = _hidden(view.mask, rng) if rng.uniform() < 0.5 else view.mask
+    seen = view.mask
+    if rng.uniform() < 0.25:
+        seen = _hidden(view.mask, rng)
+    elif rng.uniform() < 0.4:
+        seen, ground = _behind(view.mask, ground, other, rng)
     colour = np.where(seen[..., None], colour, ground)
-    mask = _wrong_mask(seen, rng) if rng.uniform() < rough else seen
+    mask = _wrong_mask(seen, rng) if rng.uniform() < 0.2 + 0.8 * rough else seen
     box = mask_bbox(mask)
     assert box is not None
     A_crop_view = square_crop(box, size=SIZE, padding_ratio=1.2)
@@ -91,10 +96,25 @@ def _relit(view: View, rng: Rng) -> Float32[np.ndarray, "S S 3"]:
         lobe = np.maximum(view.normal @ (half / np.linalg.norm(half)).astype(np.float32), 0)
         shine = shine + strength * lobe ** rng.uniform(8, 50)
     colour = albedo * np.asarray(shade)[..., None] + 255 * gloss * np.asarray(shine)[..., None]
+    if rng.uniform() < 0.6:
+        colour = colour * _shadows(view, rng)[..., None]
     tint = rng.uniform(0.8, 1.2, 3) * np.exp(rng.uniform(-0.6, 0.35))
     colour = np.clip(colour * tint, 0, 255) / 255
     lifted = colour ** np.exp(rng.uniform(-0.4, 0.4)) * (1 - rng.uniform(0, 0.12)) + rng.uniform(0, 0.1)
     return (255 * lifted).astype(np.float32)
+
+
+def _shadows(view: View, rng: Rng) -> Float32[np.ndarray, "S S"]:
+    """What hollows lose, and what something outside the picture takes from a part of it, with a soft edge."""
+    mask = view.mask.astype(np.float32)
+    sigma = rng.uniform(2, 10)
+    near = np.where(view.mask, view.depth, 0).astype(np.float32)
+    around = cv2.GaussianBlur(near, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(mask, (0, 0), sigma), 1e-3)
+    hollow = np.clip((near - around) * rng.uniform(0, 6), 0, 0.7) * mask
+    steps = int(rng.integers(2, 6))
+    field = cv2.resize(rng.normal(size=(steps, steps)).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
+    cast = 1 / (1 + np.exp(-(field - rng.uniform(-0.5, 1.5)) * np.exp(rng.uniform(0.5, 3.5))))
+    return ((1 - hollow) * (1 - rng.uniform(0, 0.65) * cast)).astype(np.float32)
 
 
 def _ground(rng: Rng) -> Float32[np.ndarray, "S S 3"]:
@@ -128,13 +148,31 @@ def _hidden(mask: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
     return mask
 
 
+def _behind(
+    mask: Bool[np.ndarray, "S S"], ground: Float32[np.ndarray, "S S 3"], other: View, rng: Rng
+) -> tuple[Bool[np.ndarray, "S S"], Float32[np.ndarray, "S S 3"]]:
+    """The silhouette less another object's before it, and the ground with that object on it."""
+    colour = _relit(other, rng)
+    at = np.argwhere(mask)[rng.integers(mask.sum())][::-1].astype(float)
+    angle, grown = rng.uniform(0, 360), rng.uniform(0.35, 1.3)
+    for shrink in (1.0, 0.7, 0.45, 0.25):
+        A = cv2.getRotationMatrix2D((SIZE / 2, SIZE / 2), angle, grown * shrink)
+        A[:, 2] += at + rng.normal(0, 8, 2) - SIZE / 2
+        cover = cv2.warpAffine(other.mask.astype(np.uint8), A, (SIZE, SIZE), flags=cv2.INTER_NEAREST) > 0
+        seen = mask & ~cover
+        if seen.sum() >= max(_LEAST_SEEN * mask.sum(), 60):
+            moved = cv2.warpAffine(colour, A, (SIZE, SIZE), flags=cv2.INTER_LINEAR)
+            return seen, np.where(cover[..., None], moved, ground)
+    return mask, ground
+
+
 def _wrong_mask(seen: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
     """The outline wavers; on some, a piece is missing or something else belongs to it."""
     steps = int(rng.integers(3, 20))
     waver = cv2.resize(rng.normal(size=(steps, steps)).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
     soft = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), rng.uniform(1, 5))
     mask = soft + rng.uniform(0.02, 0.25) * waver > rng.uniform(0.35, 0.65)
-    if rng.uniform() < 0.35:
+    if rng.uniform() < 0.5:
         at = np.argwhere(cv2.Canny(seen.astype(np.uint8) * 255, 50, 150) > 0)
         piece = np.zeros(mask.shape, np.uint8)
         y, x = at[rng.integers(len(at))] if len(at) else (SIZE // 2, SIZE // 2)

@@ -1,0 +1,99 @@
+"""an object's views -> the same views of another surface: paint and relief that are functions of the object's points.
+
+A shard holds each object with one surface. Drawn anew for every batch, the surface never repeats, and it is sharper
+than colours at vertices can be: labels, stripes, grooves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.embedded.pictures import View
+from pipeline.synthetic.parts import Rng, random_direction
+
+Points = Float[np.ndarray, "m 3"]
+Values = Float[np.ndarray, " m"]
+_WAVES = 5
+
+
+def dressed(clusters: list[list[View]], rng: Rng) -> list[list[View]]:
+    """All views of one object in one new surface; on some the paint or the relief stays as it was."""
+    coats = [_coat(rng) for _ in range(int(rng.choice([0, 1, 2, 4], p=[0.35, 0.25, 0.25, 0.15])))]
+    relief = _relief(rng) if rng.uniform() < 0.5 else None
+    return [[_dressed(view, coats, relief) for view in views] for views in clusters]
+
+
+Coat = Callable[[Points], tuple[Bool[np.ndarray, " m"], Float[np.ndarray, " 3"]]]
+
+
+def _dressed(view: View, coats: list[Coat], relief: Callable[[Points], Points] | None) -> View:
+    mask = view.mask
+    y, x = np.nonzero(mask)
+    T, K = view.T.astype(np.float64), view.K.astype(np.float64)
+    z = view.depth[y, x] + T[2, 3]
+    in_camera = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=-1)
+    points = (in_camera - T[:3, 3]) @ T[:3, :3]
+    albedo, normal = view.albedo.copy(), view.normal
+    for coat in coats:
+        covered, colour = coat(points)
+        albedo[y[covered], x[covered]] = colour
+    if relief is not None:
+        normal = normal.copy()
+        upright = normal[y, x]
+        slope = (relief(points) @ T[:3, :3].T).astype(np.float32)
+        tilted = upright - slope + (slope * upright).sum(-1, keepdims=True) * upright
+        normal[y, x] = tilted / np.maximum(np.linalg.norm(tilted, axis=-1, keepdims=True), 1e-6)
+    return replace(view, albedo=albedo, normal=normal)
+
+
+def _coat(rng: Rng) -> Coat:
+    """One colour on blotches, stripes, a label or a patch."""
+    kind, colour = rng.integers(4), rng.uniform(0, 255) + rng.normal(0, 50, 3) * rng.choice([0, 1])
+    colour = np.clip(colour, 5, 250)
+    axis, at = random_direction(rng), rng.uniform(-0.6, 0.6)
+    centre, size = random_direction(rng) * rng.uniform(0.2, 0.9), rng.uniform(0.1, 0.5)
+    waves, limit = _waves(rng, fastest=rng.uniform(5, 20)), rng.uniform(-0.5, 1.0)
+    period, share = rng.uniform(0.06, 0.6), rng.uniform(0.15, 0.6)
+
+    def cover(points: Points) -> tuple[Bool[np.ndarray, " m"], Float[np.ndarray, " 3"]]:
+        near = np.linalg.norm(points - centre, axis=-1) < size
+        if kind == 0:
+            return _sum(waves, points) > limit, colour
+        if kind == 1:
+            return (points @ axis - at) % period < share * period, colour
+        if kind == 2:  # print on a label: a patch of blotches
+            return near & (_sum(waves, points) > limit - 0.5), colour
+        return near | (np.abs(points @ axis - at) < 0.15 * size), colour
+
+    return cover
+
+
+def _relief(rng: Rng) -> Callable[[Points], Points]:
+    """Gradient of a height over the surface: bumps, or grooves of equal distance."""
+    direction, phase, weight = _waves(rng, fastest=rng.uniform(6, 40))
+    height = rng.uniform(0.05, 0.35)
+    if rng.uniform() < 0.3:
+        direction, phase, weight = direction[:1], phase[:1], np.ones(1)
+
+    def gradient(points: Points) -> Points:
+        return height * (np.cos(points @ direction.T + phase) * weight) @ direction / np.linalg.norm(direction[0])
+
+    return gradient
+
+
+Waves = tuple[Float[np.ndarray, "w 3"], Values, Values]
+
+
+def _waves(rng: Rng, *, fastest: float) -> Waves:
+    """Directions times frequencies (radians a radius), phases, weights."""
+    direction = np.stack([random_direction(rng) for _ in range(_WAVES)]) * rng.uniform(0.3, 1, (_WAVES, 1)) * fastest
+    return direction, rng.uniform(0, 2 * np.pi, _WAVES), rng.dirichlet(np.ones(_WAVES))
+
+
+def _sum(waves: Waves, points: Points) -> Values:
+    direction, phase, weight = waves
+    return np.sin(points @ direction.T + phase) @ weight / np.linalg.norm(weight)
