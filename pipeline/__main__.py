@@ -35,7 +35,7 @@ from pipeline.spec import Runtime, build
 from pipeline.store import Store
 from pipeline.whole import write_whole
 
-STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "select", "refine", "detect")
+STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}

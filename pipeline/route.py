@@ -2,7 +2,7 @@
 
 mesh -render-> templates -crop, extract-> template features -fit->     (offline, once for every object)
 image -detect, crop, extract-> query features                          (once for every image)
-query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> hypotheses -select, refine-> pose
+query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> hypotheses -choose, refine-> pose
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
+from pipeline.stages.choose import Chooser
 from pipeline.stages.cluster import Clusterer
 from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
@@ -37,7 +38,6 @@ from pipeline.stages.lift import lift
 from pipeline.stages.match import FittedMatcher, Matcher, TruthMatcher
 from pipeline.stages.refine import Refiner
 from pipeline.stages.render import Renderer
-from pipeline.stages.select import Selector
 from pipeline.stages.solve import Solver
 
 MIN_POINTS = 4
@@ -55,7 +55,7 @@ class Stages:
     cluster: Clusterer
     correspond: Corresponder
     solve: Solver
-    select: Selector
+    choose: Chooser
     refine: Refiner
     detect: Detector | DescribingDetector
     fallback: bool = False
@@ -140,7 +140,7 @@ class TemplateBank(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one template led to; ``solution`` None with the ``failure`` that stopped it. ``worth``: select's."""
+    """What one template led to; ``solution`` None with the ``failure`` that stopped it. ``worth``: choose's."""
 
     template_id: int
     template_score: float
@@ -239,7 +239,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
                 raise NoPose("lift", f"{seen.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
             solution = _solved(stages, query, points_obj, query_px_img, seen)
             parts["solution"] = solution
-        with clock("select"):
+        with clock("choose"):
             parts["worth"] = _worth(stages, query, template, pair, solution)
     except NoPose as failure:
         parts["failure"] = failure
@@ -286,10 +286,10 @@ def _template_cells(
 
 
 def _worth(stages: Stages, query: Query, template: TemplateView, pair: FusedPair, solution: PoseSolution) -> float:
-    """What select makes of a solved hypothesis."""
+    """What choose makes of a solved hypothesis."""
     _, points_obj = _template_cells(stages, template, pair)
     inliers, K_crop = int(solution.inliers.sum()), query.A_crop_img @ query.K
-    return stages.select(solution.T_cam_obj, inliers, pair, points_obj, K_crop, crop_size=stages.crop.size)
+    return stages.choose(solution.T_cam_obj, inliers, pair, points_obj, K_crop, crop_size=stages.crop.size)
 
 
 def _refined(stages: Stages, query: Query, bank: TemplateBank, best: Hypothesis, clock: Clock) -> Hypothesis:

@@ -25,6 +25,7 @@ from pipeline.items.views import Crops, Image, Proposal
 from pipeline.meshes import read_mesh, write_ply
 from pipeline.route import Stages
 from pipeline.spec import Runtime, Spec, spec
+from pipeline.stages.choose.inliers import Inliers
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.crop.square import Square
@@ -37,7 +38,6 @@ from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
-from pipeline.stages.select.inliers import Inliers
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
@@ -143,7 +143,7 @@ def graph_of(scene: Path, cache: Path, *, extract: Any = None, **changes: Any) -
         cluster=One(),
         correspond=Corresponder(),
         solve=Epnp(),
-        select=Inliers(),
+        choose=Inliers(),
         refine=NoRefinement(),
         detect=changes.pop("detect", None) or Cnos(**{**fields, **changes}),
     )

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from pipeline.spec import _tuples, build
 
 CONF = Path(__file__).parents[1] / "conf"
-STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "select", "refine", "detect")
+STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
 VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.yaml"))
 
 

@@ -13,6 +13,7 @@ from pipeline.items.views import Crops, Geometry
 from pipeline.route import Query, Stages, TemplateView, trace_pose
 from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
+from pipeline.stages.choose.inliers import Inliers
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
@@ -28,7 +29,6 @@ from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.words import Words
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
-from pipeline.stages.select.inliers import Inliers
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.objects import make_object
@@ -43,7 +43,7 @@ FULL = Stages(
     cluster=KMeans(),
     correspond=Corresponder(),
     solve=Epnp(),
-    select=Inliers(),
+    choose=Inliers(),
     refine=NoRefinement(),
     detect=GtMask(),
 )

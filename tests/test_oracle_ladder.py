@@ -14,6 +14,7 @@ from pipeline.items.poses import NoEstimate
 from pipeline.items.records import answer_of, record_of
 from pipeline.route import Stages
 from pipeline.spec import Runtime
+from pipeline.stages.choose.inliers import Inliers
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.correspond.oracle import Oracle as CorrespondOracle
@@ -26,7 +27,6 @@ from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.oracle import Oracle
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
-from pipeline.stages.select.inliers import Inliers
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
@@ -40,7 +40,7 @@ PLAIN = Stages(
     cluster=One(),
     correspond=Corresponder(),
     solve=Epnp(),
-    select=Inliers(),
+    choose=Inliers(),
     refine=NoRefinement(),
     detect=GtMask(),
 )

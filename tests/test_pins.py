@@ -138,7 +138,7 @@ def summary(name: str) -> list[float]:
     if stage == "solve":
         solution = spec(*toy_points())
         return [float(solution.inliers.sum()), *solution.T_cam_obj[:3].round(4).flatten().tolist()]
-    if stage == "select":
+    if stage == "choose":
         pair = toy_pair()
         x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
         points, K_crop = np.stack([x, y, 0 * x], axis=1), np.array([[-400.0, 0, 31.5], [0, 400.0, 31.5], [0, 0, 1]])

@@ -44,8 +44,8 @@ class Source:
     pace: int = 8
     validation: bool = False
 
-    def objects(self, step: int, count: int) -> tuple[list[list[list[View]]], Rng]:
-        """All clusters of views of the objects of a step, and the generator of the step's further draws."""
+    def objects(self, step: int, count: int, *, dress: bool = False) -> tuple[list[list[list[View]]], Rng]:
+        """All clusters of views of the objects of a step, dressed or not; the generator of the step's further draws."""
         rng = np.random.default_rng([self.seed, step, 0xBA7C])
         known = min(self.count, self.start + step // self.pace)
         found = []
@@ -53,7 +53,8 @@ class Source:
             views = _shard(self.folder, int(rng.integers(known)), self.validation)
             first = CLUSTERS_PER_OBJECT * int(rng.integers(len(views) // CLUSTERS_PER_OBJECT))
             clusters = range(first, first + CLUSTERS_PER_OBJECT)
-            found.append(dressed([[_unpacked(views, k, v) for v in range(VIEWS)] for k in clusters], rng))
+            plain = [[_unpacked(views, k, v) for v in range(VIEWS)] for k in clusters]
+            found.append(dressed(plain, rng) if dress else plain)
         return found, rng
 
 
@@ -77,21 +78,21 @@ def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n 
     """Pictures of all sorts, each of another object: two in three are photographs."""
     objects, rng = source.objects(step, count)
     views = [clusters[int(rng.integers(len(clusters)))][int(rng.integers(VIEWS))] for clusters in objects]
-    made = [
-        photograph(view, rng, other=other) if rng.uniform() < 0.67 else template(view, rng)
-        for view, other in zip(views, views[1:] + views[:1], strict=True)
-    ]
+    made = [photograph(v, rng) if rng.uniform() < 0.67 else template(v, rng) for v in views]
     return torch.from_numpy(np.stack([p.rgb for p in made]))
 
 
-def pair_batch(source: Source, step: int, *, count: int) -> PairBatch:
-    """Two photographs of the query's view of every cluster of ``count`` objects, and its other views as templates."""
-    objects, rng = source.objects(step, count)
+def pair_batch(source: Source, step: int, *, count: int, hard: bool = True) -> PairBatch:
+    """Two photographs of the query's view of every cluster of ``count`` objects, and its other views as templates.
+
+    ``hard``: with surfaces of their own (dressing), other objects in front of them, shadows and worse masks.
+    """
+    objects, rng = source.objects(step, count, dress=hard)
     pictures: list[Picture] = []
     parts, angles = [], []
     for clusters, others in zip(objects, objects[1:] + objects[:1], strict=True):
         for views in clusters:
-            queries = [photograph(views[0], rng, other=_any(others, rng)) for _ in range(QUERIES)]
+            queries = [photograph(views[0], rng, other=_any(others, rng) if hard else None) for _ in range(QUERIES)]
             pictures += queries + [template(view, rng) for view in views[1:]]
             parts += [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
         R_template = _rotations([view for views in clusters for view in views[1:]])

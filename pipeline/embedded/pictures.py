@@ -53,21 +53,22 @@ def template(view: View, rng: Rng) -> Picture:
     return Picture(rgb, view.mask, view.mask, np.eye(3))
 
 
-def photograph(view: View, rng: Rng, *, other: View) -> Picture:
+def photograph(view: View, rng: Rng, *, other: View | None = None) -> Picture:
     """Another light, camera and crop; hidden in part, small, blurred, noisy, its mask not quite right.
 
     How bad it is varies from nearly perfect to hardly legible: what can be placed exactly has to be placed exactly.
-    ``other`` shows an object that may stand before this one.
+    ``other`` shows an object that may stand before this one; with it come shadows and worse masks.
     """
     rough = float(rng.uniform())
-    colour, ground = _relit(view, rng), _ground(rng)
+    colour, ground = _relit(view, rng, shadows=other is not None), _ground(rng)
     seen = view.mask
-    if rng.uniform() < 0.25:
+    if rng.uniform() < (0.5 if other is None else 0.25):
         seen = _hidden(view.mask, rng)
-    elif rng.uniform() < 0.4:
+    elif other is not None and rng.uniform() < 0.4:
         seen, ground = _behind(view.mask, ground, other, rng)
     colour = np.where(seen[..., None], colour, ground)
-    mask = _wrong_mask(seen, rng) if rng.uniform() < 0.2 + 0.8 * rough else seen
+    badly = (rough, 0.35) if other is None else (0.2 + 0.8 * rough, 0.5)
+    mask = _wrong_mask(seen, rng, by_a_piece=badly[1]) if rng.uniform() < badly[0] else seen
     box = mask_bbox(mask)
     assert box is not None
     A_crop_view = square_crop(box, size=SIZE, padding_ratio=1.2)
@@ -81,7 +82,7 @@ def _rays(view: View) -> Float32[np.ndarray, "S S 3"]:
     return np.stack([*np.meshgrid(x, y), np.ones((SIZE, SIZE), np.float32)], axis=-1)
 
 
-def _relit(view: View, rng: Rng) -> Float32[np.ndarray, "S S 3"]:
+def _relit(view: View, rng: Rng, *, shadows: bool) -> Float32[np.ndarray, "S S 3"]:
     """Lambert under one or two lights with gloss; colours, white balance, exposure and contrast of another camera."""
     albedo = view.albedo.astype(np.float32)
     grey = albedo.mean(axis=-1, keepdims=True)
@@ -96,7 +97,7 @@ def _relit(view: View, rng: Rng) -> Float32[np.ndarray, "S S 3"]:
         lobe = np.maximum(view.normal @ (half / np.linalg.norm(half)).astype(np.float32), 0)
         shine = shine + strength * lobe ** rng.uniform(8, 50)
     colour = albedo * np.asarray(shade)[..., None] + 255 * gloss * np.asarray(shine)[..., None]
-    if rng.uniform() < 0.6:
+    if shadows and rng.uniform() < 0.6:
         colour = colour * _shadows(view, rng)[..., None]
     tint = rng.uniform(0.8, 1.2, 3) * np.exp(rng.uniform(-0.6, 0.35))
     colour = np.clip(colour * tint, 0, 255) / 255
@@ -152,7 +153,7 @@ def _behind(
     mask: Bool[np.ndarray, "S S"], ground: Float32[np.ndarray, "S S 3"], other: View, rng: Rng
 ) -> tuple[Bool[np.ndarray, "S S"], Float32[np.ndarray, "S S 3"]]:
     """The silhouette less another object's before it, and the ground with that object on it."""
-    colour = _relit(other, rng)
+    colour = _relit(other, rng, shadows=True)
     at = np.argwhere(mask)[rng.integers(mask.sum())][::-1].astype(float)
     angle, grown = rng.uniform(0, 360), rng.uniform(0.35, 1.3)
     for shrink in (1.0, 0.7, 0.45, 0.25):
@@ -166,13 +167,13 @@ def _behind(
     return mask, ground
 
 
-def _wrong_mask(seen: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
-    """The outline wavers; on some, a piece is missing or something else belongs to it."""
+def _wrong_mask(seen: Bool[np.ndarray, "S S"], rng: Rng, *, by_a_piece: float) -> Bool[np.ndarray, "S S"]:
+    """The outline wavers; on a share of them, a piece is missing or something else belongs to it."""
     steps = int(rng.integers(3, 20))
     waver = cv2.resize(rng.normal(size=(steps, steps)).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
     soft = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), rng.uniform(1, 5))
     mask = soft + rng.uniform(0.02, 0.25) * waver > rng.uniform(0.35, 0.65)
-    if rng.uniform() < 0.5:
+    if rng.uniform() < by_a_piece:
         at = np.argwhere(cv2.Canny(seen.astype(np.uint8) * 255, 50, 150) > 0)
         piece = np.zeros(mask.shape, np.uint8)
         y, x = at[rng.integers(len(at))] if len(at) else (SIZE // 2, SIZE // 2)

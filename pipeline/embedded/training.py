@@ -49,12 +49,13 @@ _EMA, _WARMUP = 0.998, 50
 
 @dataclass(frozen=True)
 class Plan:
-    """How many steps each stage takes, and what of."""
+    """How many steps each stage takes, and what of; the first ``easy`` of the descriptors are on easier pictures."""
 
     shards: int = 150
     autoencoder: int = 500
     denoiser: int = 400
     descriptors: int = 6000
+    easy: int = 2700
     seed: int = 0
 
 
@@ -171,7 +172,7 @@ class Descriptors(Stage):
 
     def loss(self, step: int) -> dict[str, Tensor]:
         """Both losses of 2 objects' 2 clusters of 8 pictures."""
-        batch = pair_batch(self.source, step, count=2)
+        batch = pair_batch(self.source, step, count=2, hard=step >= self.plan.easy)
         return described_losses(self.model, self.encode(batch.rgb), batch)
 
 

@@ -18,7 +18,7 @@ from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
 POSES_VERSION = 2
-ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "select", "refine")
+ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "refine")
 
 
 @dataclass(eq=False)

@@ -68,7 +68,7 @@ TITLES = {
     "render.count": "Number of templates",
     "correspond.kernel": "Side of the sub-pixel neighbourhood, cells",
     "solve": "Solver",
-    "select": "What decides between templates",
+    "choose": "What decides between templates",
     "refine": "Refinement",
     "extract": "Features",
     "match": "Template match",

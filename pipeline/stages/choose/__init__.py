@@ -11,8 +11,8 @@ from pipeline.items.features import FusedPair
 from pipeline.spec import Variant
 
 
-class Selector(Variant, Protocol):
-    """What a select variant is.
+class Chooser(Variant, Protocol):
+    """What a choose variant is.
 
     ``points_obj`` and ``K_crop`` are those of stages.refine: object points (mm) at the centres of the template's
     foreground cells, NaN off the object, and camera frame to crop pixels, ``crop_size`` of them a side.

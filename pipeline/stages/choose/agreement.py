@@ -22,7 +22,7 @@ class Agreement(Spec):
     template may agree on a pose that explains a part of the object; few cosines do.
     """
 
-    kind: ClassVar[str] = "select.agreement"
+    kind: ClassVar[str] = "choose.agreement"
     version: ClassVar[int] = 1
 
     inlier_power: NonNegativeFloat = 0.5

@@ -8,8 +8,8 @@ from pipeline.errors import BadInput
 from pipeline.functional.agreement import agreement
 from pipeline.items.features import FusedPair
 from pipeline.spec import build
-from pipeline.stages.select.agreement import Agreement
-from pipeline.stages.select.inliers import Inliers
+from pipeline.stages.choose.agreement import Agreement
+from pipeline.stages.choose.inliers import Inliers
 
 CELLS, SIZE, FOCAL, FAR = 32, 64, 400.0, 400.0
 K_CROP = np.array([[FOCAL, 0, 31.5], [0, FOCAL, 31.5], [0, 0, 1]])
@@ -103,5 +103,5 @@ def test_inliers_decide_between_poses_that_agree_alike():
 
 
 def test_a_negative_power_is_refused():
-    with pytest.raises(BadInput, match=r"select.inlier_power: found -1.0, needs greater than or equal to 0"):
-        build(Agreement, {"inlier_power": -1.0}, where="select")
+    with pytest.raises(BadInput, match=r"choose.inlier_power: found -1.0, needs greater than or equal to 0"):
+        build(Agreement, {"inlier_power": -1.0}, where="choose")

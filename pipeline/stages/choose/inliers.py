@@ -15,7 +15,7 @@ from pipeline.spec import Spec, spec
 class Inliers(Spec):
     """Most inliers win (FoundPose, Örnek et al., ECCV 2024)."""
 
-    kind: ClassVar[str] = "select.inliers"
+    kind: ClassVar[str] = "choose.inliers"
     version: ClassVar[int] = 1
 
     def __call__(
