@@ -10,10 +10,11 @@ import torch
 from make_sd15 import write_folder
 from safetensors.torch import load_file, save_file
 
+from pipeline.checkpoints import is_local
 from pipeline.errors import BadInput
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
-from pipeline.stages.extract.weights import alphas_cumprod, find, is_local
+from pipeline.stages.extract.weights import alphas_cumprod, find
 
 CPU = Runtime(device="cpu", batch=2)
 UNET = "unet/diffusion_pytorch_model.safetensors"

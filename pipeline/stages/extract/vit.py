@@ -68,7 +68,7 @@ class VitFeatures(Spec, ABC):
     @cached_property
     def source(self) -> TransformersFolder:
         """The weights, found (and fetched, for a hub id). Raises BadInput."""
-        return find(self.weights, self.revision, self.model_types)
+        return find(self.weights, self.revision, self.model_types, self.kind.partition(".")[2])
 
     @cached_property
     def architecture(self) -> Architecture:
