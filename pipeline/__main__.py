@@ -16,6 +16,7 @@ import time
 import traceback
 from collections.abc import Mapping
 from concurrent.futures import BrokenExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pipeline.cache_cli import cache_command
+from pipeline.checkpoints import NotFetched, offline
 from pipeline.errors import BadInput, DzopError
 from pipeline.route import Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
@@ -130,12 +132,17 @@ def _job(config: DictConfig, *, sweeping: bool) -> None:
             raise BadInput("plan=true step=report", found="a step without a plan", needed="plan=false, or another step")
         make_report(values["out"])
         return
+    with offline() if values["plan"] is True else nullcontext():
+        _run(values, resume=sweeping)
+
+
+def _run(values: dict[str, Any], *, resume: bool) -> None:
     run(
         stages=stages_of(values),
         dataset=variant(values["dataset"], "dataset"),
         store=Store(variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),
         runtime=build(Runtime, values["runtime"], where="runtime"),
-        options=options_of(values, resume=sweeping),
+        options=options_of(values, resume=resume),
     )
 
 
@@ -143,10 +150,17 @@ def stages_of(values: Mapping[str, Any]) -> Stages:
     """The stages a configuration chooses."""
     chosen = {name: variant(values[name], name) for name in STAGES}
     if hasattr(chosen["fuse"], "resolve_for"):
-        chosen["fuse"] = chosen["fuse"].resolve_for(chosen["extract"].model)
+        chosen["fuse"] = chosen["fuse"].resolve_for(_model_of(chosen["extract"]))
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
     return Stages(**chosen, fallback=values["fallback"])
+
+
+def _model_of(extract: Any) -> str:
+    try:
+        return str(extract.model)
+    except NotFetched:
+        return str(extract.kind)  # a head is trained on weights that ship, never on such as have to be fetched
 
 
 def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:

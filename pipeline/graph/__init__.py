@@ -15,9 +15,13 @@ poses, ground truth -> scores                                                   
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
+from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import proposal_nodes
@@ -31,7 +35,7 @@ from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
 from pipeline.stages.fuse import TrainedFuser
 
-__all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
+__all__ = ["Context", "Graph", "Judged", "Memory", "Node", "Retraced", "ScoreNodes"]
 
 
 class Graph:
@@ -47,6 +51,7 @@ class Graph:
     def check(self) -> None:
         """Raise BadInput for a device, weights or a layer that are not there, before any work."""
         self.run.runtime.torch_device()
+        _ = self.run.runtime.memory_bytes, self.run.runtime.vram_bytes
         stages = self.run.stages
         if isinstance(stages.fuse, TrainedFuser):
             stages.fuse.check(stages.extract.model)
@@ -66,6 +71,15 @@ class Graph:
             if where := self.run.dataset.told_where:
                 raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
             self.detections.proposals.check()
+        self.templates.views = fit_to_budgets(self.run, self.detections.proposals)
+
+    def memory(self, *, passes: bool) -> tuple[Memory, Memory | None]:
+        """What the run will take at its peak: of the machine, and of the device where that is another.
+
+        ``passes``: whether any image has to go through a backbone.
+        """
+        need = need_of(self.run, self.detections.proposals)
+        return memory_of(self.run, need if passes else replace(need, weights=0, footprint=None))
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
@@ -93,6 +107,6 @@ class Graph:
         """Shows how answers came about."""
         return Retracer(self.templates, self.queries, self.poses)
 
-    def plan(self) -> list[Node]:
-        """Every node with its state, key, size and cost."""
+    def plan(self) -> Iterator[Node]:
+        """Every node with its state, key, size and cost. Raises NotFetched where weights decide that are not here."""
         return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()
