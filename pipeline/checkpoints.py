@@ -63,10 +63,10 @@ def fetched(hub_id: str, revision: str | None, patterns: Sequence[str], *, field
         if here:
             found = f"{hub_id!r}, a hub id that was not fetched yet: its revision is not known offline"
             raise NotFetched(field, found=found, needed="a run, which fetches it, or a local folder") from None
-        fault = error
+        told = one_line(error)
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        fault = error
-    found = f"{hub_id!r}, which is no local path and was not fetched: {one_line(fault).removeprefix('Got: ')}"
+        told = one_line(error)
+    found = f"{hub_id!r}, which is no local path and was not fetched: {told.removeprefix('Got: ')}"
     needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder" + everywhere(name)
     raise BadInput(field, found=found, needed=needed)
 

@@ -141,14 +141,16 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
 
 def _plan(graph: Graph, options: Options) -> None:
     """Every node, and what the missing ones will cost; nothing is computed and nothing fetched."""
-    run, nodes, unknown = graph.run, [], None
+    run, unknown = graph.run, None
+    nodes: list[Node] = []
     try:
         graph.check()
         print(_headline(options, run.stages, run.dataset, run.targets, run.store), flush=True)
     except NotFetched as fault:
         unknown = fault
     try:
-        nodes += graph.plan()
+        for node in graph.planned():
+            nodes.append(node)  # one by one: those before an unknown one are kept
         if (scores := _scores(graph, options)) and graph.detections.known:
             nodes.append(scores.node())
     except NotFetched as fault:
@@ -192,9 +194,11 @@ def _estimate(graph: Graph, options: Options) -> None:
     if options.resume and scores is not None and outputs.finished():
         print(f"finished before: {outputs.row_path}")
         return
+    for doubt in (odd := graph.doubts())[:ROWS_SHOWN]:
+        print(f"warning: {doubt}", flush=True)
     answers = graph.estimate()
     judged = None if scores is None else scores.judge(answers)
-    outputs.write_files(answers, judged)
+    outputs.write_files(answers, judged, odd)
     if options.overlays:
         outputs.draw_overlays(answers, judged)
     _show(answers, judged, theta_max=theta_max)

@@ -110,7 +110,8 @@ def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
         message = first["msg"].removeprefix("Value error, ")
         needed = message[0].lower() + message[1:].removeprefix("nput should be ")
         needed = needed.removeprefix("i") if message.startswith("Input should be ") else needed
-        raise BadInput(field, found=repr(first["input"]), needed=needed) from None
+        found = getattr(first["input"], "kind", None) or repr(first["input"])  # a whole spec would fill the screen
+        raise BadInput(field, found=found, needed=needed) from None
 
 
 def _shown(value: Any) -> Any:

@@ -21,6 +21,7 @@ from dataclasses import replace
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
+from pipeline.graph.doubts import doubts
 from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
@@ -29,7 +30,7 @@ from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
-from pipeline.items.features import SALIENCY_LAYER
+from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
@@ -65,7 +66,8 @@ class Graph:
                     found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
                     raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
                 if "layer" in fault.where:
-                    raise BadInput(asked[layer], found=fault.found, needed=fault.needed) from None
+                    needed = fault.needed.replace(f", {PSEUDO_LAYERS}", "")  # no maps: neither field takes them
+                    raise BadInput(asked[layer], found=fault.found, needed=needed) from None
                 raise
         if self.detections.proposals:
             if where := self.run.dataset.told_where:
@@ -92,6 +94,10 @@ class Graph:
         """Detections of all targets, those that cannot be used included."""
         return self.detections.all
 
+    def doubts(self) -> list[str]:
+        """What is odd about the detections, a line each."""
+        return doubts(self.run, self.detect())
+
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
         self.detect()  # first: a fault in its files must not wait for hours of onboarding
@@ -107,6 +113,10 @@ class Graph:
         """Shows how answers came about."""
         return Retracer(self.templates, self.queries, self.poses)
 
-    def plan(self) -> Iterator[Node]:
-        """Every node with its state, key, size and cost. Raises NotFetched where weights decide that are not here."""
+    def plan(self) -> list[Node]:
+        """Every node with its state, key, size and cost."""
+        return list(self.planned())
+
+    def planned(self) -> Iterator[Node]:
+        """The nodes of a plan one by one. Raises NotFetched where weights decide that are not here."""
         return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()

@@ -26,7 +26,7 @@ from pipeline.checkpoints import tensor_shapes
 from pipeline.digests import files_digest
 from pipeline.errors import BadInput
 from pipeline.functional.binning import bin_count, log_binned
-from pipeline.items.features import CLASS_TOKEN_LAYER, SALIENCY_LAYER, FeatureMaps
+from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
 from pipeline.stages.extract.diffusion import network_image
@@ -177,8 +177,7 @@ def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
     a, last = spec.architecture, spec.architecture.depth - 1
     for layer in layers:
         if not 0 <= layer <= last and layer not in (SALIENCY_LAYER, CLASS_TOKEN_LAYER):
-            others = f"{SALIENCY_LAYER} (saliency) or {CLASS_TOKEN_LAYER} (class token)"
-            needed = f"0..{last}, the transformer's {a.depth} blocks, {others}"
+            needed = f"0..{last}, the transformer's {a.depth} blocks, {PSEUDO_LAYERS}"
             raise BadInput("extract layer", found=layer, needed=needed)
     if a.patch % spec.stride_px:
         divisors = ", ".join(str(n) for n in range(1, a.patch + 1) if a.patch % n == 0)
