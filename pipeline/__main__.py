@@ -6,16 +6,20 @@ and ``dzop lint ...`` take results files.
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import os
 import shutil
 import sys
 import tempfile
+import textwrap
 import time
 import traceback
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pipeline.cache_cli import cache_command
+from pipeline.checkpoints import NotFetched, offline
 from pipeline.errors import BadInput, DzopError
 from pipeline.route import Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
@@ -41,12 +46,16 @@ CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if 
 COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
 FAILED = "DZOP_FAILED_JOBS"
 """Environment variable: folder where a sweep's jobs, in whatever process a launcher runs them, leave their errors."""
+CLOSING = 3
+"""Failed jobs, and reasons, that a sweep's last line names; all are told when they fail and in the report."""
 KILLED = "a process of the sweep was killed, often for want of memory; the same command goes on where it stopped"
 
 
 def main() -> None:
     """Run, and turn whatever a user can mend into one line on stderr and exit status 1."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing a paragraph; the line below is the message
+    # what Ctrl-C leaves behind of a read or write
+    warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
     logging.raiseExceptions = False  # Hydra's log of a sweep's jobs has no more to say once its reader has left
     try:
         if sys.argv[1:2] and sys.argv[1] in COMMANDS:
@@ -74,11 +83,29 @@ def _run_jobs() -> None:
     os.environ[FAILED] = str(folder)
     try:
         _hydra_main()
-        failed = [path.read_text() for path in sorted(folder.glob("*"))]
+        failed = [json.loads(path.read_text()) for path in sorted(folder.glob("*"))]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     if failed:
-        sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {'; '.join(failed)}")
+        sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {_closing(failed)}")
+
+
+def _closing(failed: Sequence[tuple[Sequence[str], str]]) -> str:
+    """Which jobs, by what each has and the command line does not say of all, and why; those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for overrides, message in failed:
+        own = " ".join(word for word in overrides if word not in sys.argv) or "a job"
+        by_reason.setdefault(message, []).append(own)
+    told = [
+        f"{_first(jobs, ', ')} ({textwrap.shorten(why, 240, placeholder=' ...')})" for why, jobs in by_reason.items()
+    ]
+    return _first(told, "; ")
+
+
+def _first(parts: Sequence[str], comma: str) -> str:
+    """The first few, and how many there are beside them."""
+    more = f"{comma}and {len(parts) - CLOSING} more, told above" if len(parts) > CLOSING else ""
+    return comma.join(parts[:CLOSING]) + more
 
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
@@ -108,7 +135,7 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
-    write_whole(Path(os.environ[FAILED]) / f"{number:06d}", f"{' '.join(overrides)} ({message})")
+    write_whole(Path(os.environ[FAILED]) / f"{number:06d}", json.dumps([overrides, message]))
     values = cast(dict[str, Any], _writable(OmegaConf.to_container(config, resolve=True)))
     note_failure(values["out"], values, overrides, message)
 
@@ -130,12 +157,17 @@ def _job(config: DictConfig, *, sweeping: bool) -> None:
             raise BadInput("plan=true step=report", found="a step without a plan", needed="plan=false, or another step")
         make_report(values["out"])
         return
+    with offline() if values["plan"] is True else nullcontext():
+        _run(values, resume=sweeping)
+
+
+def _run(values: dict[str, Any], *, resume: bool) -> None:
     run(
         stages=stages_of(values),
         dataset=variant(values["dataset"], "dataset"),
         store=Store(variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),
         runtime=build(Runtime, values["runtime"], where="runtime"),
-        options=options_of(values, resume=sweeping),
+        options=options_of(values, resume=resume),
     )
 
 
@@ -143,10 +175,17 @@ def stages_of(values: Mapping[str, Any]) -> Stages:
     """The stages a configuration chooses."""
     chosen = {name: variant(values[name], name) for name in STAGES}
     if hasattr(chosen["fuse"], "resolve_for"):
-        chosen["fuse"] = chosen["fuse"].resolve_for(chosen["extract"].model)
+        chosen["fuse"] = chosen["fuse"].resolve_for(_model_of(chosen["extract"]))
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
     return Stages(**chosen, fallback=values["fallback"])
+
+
+def _model_of(extract: Any) -> str:
+    try:
+        return str(extract.model)
+    except NotFetched:
+        return str(extract.kind)  # a head is trained on weights that ship, never on such as have to be fetched
 
 
 def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:

@@ -86,8 +86,8 @@ class Outputs:
         write_detections(path, self.graph.detections.all)
         return path
 
-    def write_files(self, answers: Sequence[Answer], judged: Judged | None) -> None:
-        """The csv, poses.json, and detections.json of those that were not read from a file."""
+    def write_files(self, answers: Sequence[Answer], judged: Judged | None, warnings: Sequence[str]) -> None:
+        """The csv, poses.json (``warnings``: odd detections), and detections.json of those not read from a file."""
         if self.graph.detections.proposals:
             self.write_detections()
         estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
@@ -101,6 +101,7 @@ class Outputs:
             "config": self.config,
             "counts": self.graph.run.tally.as_record(),
             "scores": judged and summary_of(judged.scored),
+            "warnings": list(warnings),
             "answers": told,
         }
         write_json(self.folder / "poses.json", record)

@@ -13,6 +13,7 @@ import torch
 from pydantic import Field
 
 from pipeline.bop.dataset import Dataset
+from pipeline.checkpoints import NotFetched
 from pipeline.digests import remember_in
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes
@@ -115,19 +116,54 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     data = dataset.open()
     targets = options.select.of(data)
     graph = Graph(Context(stages, data, targets, store, runtime, Tally(runtime.progress)))
-    graph.check()
-    print(_headline(options, stages, data, targets, store), flush=True)
     if options.plan:
-        scores = _scores(graph, options)
-        print(plan_table([*graph.plan(), *([scores.node()] if scores and graph.detections.known else [])]))
+        _plan(graph, options)
         return
-    if options.step == "onboard":
-        graph.onboard()
-    elif options.step == "detect":
-        _detect(graph, options)
-    else:
-        _estimate(graph, options)
+    graph.check()
+    _hold_to_vram(graph.run)
+    print(_headline(options, stages, data, targets, store), flush=True)
+    try:
+        if options.step == "onboard":
+            graph.onboard()
+        elif options.step == "detect":
+            _detect(graph, options)
+        else:
+            _estimate(graph, options)
+    except torch.cuda.OutOfMemoryError as error:
+        needed = "a smaller runtime.batch (0 = sized to memory), extract.dtype=float16, or more in runtime.max_vram"
+        raise BadInput(
+            f"memory of {graph.run.device}", found=" ".join(str(error).split())[:200], needed=needed
+        ) from None
+    finally:
+        graph.run.rates.save()
     print(f"\n{graph.run.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+
+
+def _plan(graph: Graph, options: Options) -> None:
+    """Every node, and what the missing ones will cost; nothing is computed and nothing fetched."""
+    run, unknown = graph.run, None
+    nodes: list[Node] = []
+    try:
+        graph.check()
+        print(_headline(options, run.stages, run.dataset, run.targets, run.store), flush=True)
+    except NotFetched as fault:
+        unknown = fault
+    try:
+        for node in graph.planned():
+            nodes.append(node)  # one by one: those before an unknown one are kept
+        if (scores := _scores(graph, options)) and graph.detections.known:
+            nodes.append(scores.node())
+    except NotFetched as fault:
+        unknown = fault
+    print(plan_table(nodes))
+    if unknown is not None:
+        print(f"{unknown}; what follows from these weights is not listed")
+        return
+    print(costs_text(nodes))
+    here, on_device = graph.memory(passes=any(node.passes for node in nodes))
+    print(f"memory  at the peak about {here.text()}")
+    if on_device is not None:
+        print(f"vram    at the peak about {on_device.text()}")
 
 
 def _detect(graph: Graph, options: Options) -> None:
@@ -158,9 +194,11 @@ def _estimate(graph: Graph, options: Options) -> None:
     if options.resume and scores is not None and outputs.finished():
         print(f"finished before: {outputs.row_path}")
         return
+    for doubt in (odd := graph.doubts())[:ROWS_SHOWN]:
+        print(f"warning: {doubt}", flush=True)
     answers = graph.estimate()
     judged = None if scores is None else scores.judge(answers)
-    outputs.write_files(answers, judged)
+    outputs.write_files(answers, judged, odd)
     if options.overlays:
         outputs.draw_overlays(answers, judged)
     _show(answers, judged, theta_max=theta_max)
@@ -218,6 +256,13 @@ def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float)
             print(f"correspondences: median {error:.1%} of the diameter off, parallel to the image")
 
 
+def _hold_to_vram(run: Context) -> None:
+    """What torch keeps of the device's memory for later counts as well."""
+    if run.runtime.vram_bytes is not None and run.device.startswith("cuda"):
+        total = torch.cuda.get_device_properties(run.device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(1.0, run.runtime.vram_bytes / total), run.device)
+
+
 def _use_threads(threads: int) -> None:
     if threads:
         torch.set_num_threads(threads)
@@ -245,6 +290,40 @@ def plan_table(nodes: Sequence[Node]) -> str:
         mine = [node for node in nodes if node.state == state]
         lines.append(f"{len(mine)} nodes {state}, {human(sum(node.nbytes for node in mine))}")
     return "\n".join(lines)
+
+
+def costs_text(nodes: Sequence[Node]) -> str:
+    """What the nodes that are not cached will write, pass through backbones, and take in time."""
+    missing = [node for node in nodes if node.state != "cached"]
+    exact = sum(node.nbytes for node in missing if "crops" not in node.step and node.step != "templates")
+    packed = sum(node.nbytes for node in missing if node.sized) - exact
+    steps = dict.fromkeys(node.step for node in missing)
+    small = [step for step in steps if any(node.step == step and not node.sized for node in missing)]
+    told, unknown = [], []
+    for step in steps:
+        seconds = [node.seconds for node in missing if node.step == step]
+        known = [s for s in seconds if s is not None]
+        if known and len(known) == len(seconds):
+            told.append((step, sum(known)))
+        else:
+            unknown.append(step)
+    parts = ", ".join(f"{step} {duration(seconds)}" for step, seconds in told)
+    time_ = f"{duration(sum(s for _, s in told))} ({parts})" if told else "nothing to compute"
+    if unknown:
+        time_ = f"{time_} and " if told else ""
+        time_ += f"unknown for {', '.join(unknown)}: not measured on this machine in this store"
+    disk = f"{human(exact)} of features and fits, at most {human(packed)} of templates and crops (compressed)"
+    disk += f", and the records of {', '.join(small)}" if small else ""
+    return (
+        f"disk    {disk}\npasses  {sum(node.passes for node in missing)} images through the backbone\ntime    {time_}"
+    )
+
+
+def duration(seconds: float) -> str:
+    """Seconds in a unit a person reads."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def note_failure(out: str, config: Mapping[str, Any], overrides: Sequence[str], message: str) -> None:

@@ -111,7 +111,8 @@ def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
         message = first["msg"].removeprefix("Value error, ")
         needed = message[0].lower() + message[1:].removeprefix("nput should be ")
         needed = needed.removeprefix("i") if message.startswith("Input should be ") else needed
-        raise BadInput(field, found=repr(first["input"]), needed=needed) from None
+        found = getattr(first["input"], "kind", None) or repr(first["input"])  # a whole spec would fill the screen
+        raise BadInput(field, found=found, needed=needed) from None
 
 
 def _shown(value: Any) -> Any:
@@ -130,12 +131,26 @@ def _tuples(value: Any) -> Any:
 class Runtime:
     """How to compute: never part of a key, never a reason for other results.
 
-    ``device`` is "auto", "cpu", "cuda" or "cuda:N"; ``batch`` the images per backbone pass, 0 = sized to memory.
+    ``device`` is "auto", "cpu", "cuda" or "cuda:N"; ``batch`` the images per backbone pass, 0 = sized to memory;
+    ``max_vram`` and ``max_memory`` what the run may take of the device's memory and of the machine's, such as 8GiB,
+    None = whatever is free.
     """
 
     device: str = "auto"
     batch: int = 0
+    max_vram: str | int | None = None
+    max_memory: str | int | None = None
     progress: bool = True
+
+    @property
+    def vram_bytes(self) -> int | None:
+        """``max_vram`` in bytes. Raises BadInput for what is no size."""
+        return _size_bytes(self.max_vram, "runtime.max_vram")
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """``max_memory`` in bytes. Raises BadInput for what is no size."""
+        return _size_bytes(self.max_memory, "runtime.max_memory")
 
     def torch_device(self) -> str:
         """Torch's name of the device. Raises BadInput when CUDA is asked for and absent."""
@@ -148,6 +163,20 @@ class Runtime:
         if self.device.startswith("cuda") and not torch.cuda.is_available():
             raise BadInput("runtime.device", found=repr(self.device), needed="a CUDA device, and torch sees none")
         return self.device
+
+
+_UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12,
+          "KIB": 1 << 10, "MIB": 1 << 20, "GIB": 1 << 30, "TIB": 1 << 40}  # fmt: skip
+
+
+def _size_bytes(size: object, field: str) -> int | None:
+    if size is None:
+        return None
+    found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?([KMGT]i?B|B)", str(size), re.IGNORECASE)
+    nbytes = 0 if found is None else int(float(found[1]) * _UNITS[found[2].upper()])
+    if nbytes < 1:
+        raise BadInput(field, found=repr(size), needed="a size with its unit, such as 8GiB or 500MB, or null")
+    return nbytes
 
 
 Dtype = Literal["float32", "float16", "bfloat16"]

@@ -15,8 +15,8 @@ from typing import Any
 
 import torch
 
+from pipeline.stages.extract.loading import empty_model
 from pipeline.stages.extract.random_sd import with_random_weights
-from pipeline.stages.extract.weights import empty_model
 
 VOCABULARY = 49408
 

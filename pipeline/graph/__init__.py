@@ -15,9 +15,14 @@ poses, ground truth -> scores                                                   
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
+from pipeline.graph.doubts import doubts
+from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import proposal_nodes
@@ -25,13 +30,13 @@ from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
-from pipeline.items.features import SALIENCY_LAYER
+from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
 from pipeline.stages.fuse import TrainedFuser
 
-__all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
+__all__ = ["Context", "Graph", "Judged", "Memory", "Node", "Retraced", "ScoreNodes"]
 
 
 class Graph:
@@ -47,6 +52,7 @@ class Graph:
     def check(self) -> None:
         """Raise BadInput for a device, weights or a layer that are not there, before any work."""
         self.run.runtime.torch_device()
+        _ = self.run.runtime.memory_bytes, self.run.runtime.vram_bytes
         stages = self.run.stages
         if isinstance(stages.fuse, TrainedFuser):
             stages.fuse.check(stages.extract.model)
@@ -60,12 +66,22 @@ class Graph:
                     found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
                     raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
                 if "layer" in fault.where:
-                    raise BadInput(asked[layer], found=fault.found, needed=fault.needed) from None
+                    needed = fault.needed.replace(f", {PSEUDO_LAYERS}", "")  # no maps: neither field takes them
+                    raise BadInput(asked[layer], found=fault.found, needed=needed) from None
                 raise
         if self.detections.proposals:
             if where := self.run.dataset.told_where:
                 raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
             self.detections.proposals.check()
+        self.templates.views = fit_to_budgets(self.run, self.detections.proposals)
+
+    def memory(self, *, passes: bool) -> tuple[Memory, Memory | None]:
+        """What the run will take at its peak: of the machine, and of the device where that is another.
+
+        ``passes``: whether any image has to go through a backbone.
+        """
+        need = need_of(self.run, self.detections.proposals)
+        return memory_of(self.run, need if passes else replace(need, weights=0, footprint=None))
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
@@ -77,6 +93,10 @@ class Graph:
     def detect(self) -> list[Detection]:
         """Detections of all targets, those that cannot be used included."""
         return self.detections.all
+
+    def doubts(self) -> list[str]:
+        """What is odd about the detections, a line each."""
+        return doubts(self.run, self.detect())
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
@@ -95,4 +115,8 @@ class Graph:
 
     def plan(self) -> list[Node]:
         """Every node with its state, key, size and cost."""
+        return list(self.planned())
+
+    def planned(self) -> Iterator[Node]:
+        """The nodes of a plan one by one. Raises NotFetched where weights decide that are not here."""
         return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()

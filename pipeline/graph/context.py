@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from jaxtyping import Float
 
 from pipeline.bop.dataset import Dataset
 from pipeline.errors import DzopError
+from pipeline.graph.kept import Kept
+from pipeline.graph.rates import Rates, work_of
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crops, Target
 from pipeline.route import Stages
@@ -20,6 +22,8 @@ from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
 from pipeline.store import Layout, Ref, Store, make_ref
 from pipeline.tally import Tally
+
+MESHES_BYTES = 256 << 20
 
 ImageId = tuple[int, int]
 """(scene_id, im_id)"""
@@ -48,8 +52,13 @@ class Context:
 
     @cached_property
     def model(self) -> Callable[[int], ObjectModel]:
-        """An object's mesh, read once."""
-        return lru_cache(maxsize=None)(self.dataset.object_model)
+        """An object's mesh; the last ones stay in memory, so that it does not grow with the number of objects."""
+        return Kept(self.dataset.object_model, _mesh_bytes, MESHES_BYTES)
+
+    @cached_property
+    def rates(self) -> Rates:
+        """Seconds of rows as they were measured on this machine."""
+        return Rates(self.store.backend.folder, self.device)
 
     @cached_property
     def backbone(self) -> Backbone:
@@ -101,8 +110,12 @@ class Context:
         batch: int,
         compute: Callable[[list[int]], Any],
         document: Mapping[str, Any] | None = None,
+        work: str = "",
     ) -> None:
-        """Fill entries and count them, with a bar when the step has a title of its own."""
+        """Fill entries and count them, with a bar when the step has a title of its own.
+
+        ``work``: what decides the seconds of a row, for plans; "" where nobody asks.
+        """
         if all(self.store.complete(ref) for ref in refs):
             self.tally.add(step, reused=rows)
             return
@@ -110,6 +123,8 @@ class Context:
         with progress.bar(rows, title, "row") as advance:
             filled = self.store.fill(refs, rows=rows, batch=batch, compute=compute, document=document, progress=advance)
         self.tally.add(step, computed=filled.computed, reused=filled.reused, time_s=filled.time_s)
+        if work and filled.computed:
+            self.rates.note(work, filled.computed, filled.time_s)
 
     def extract(
         self, step: str, title: str, refs: Mapping[int, Ref], rows: int, crops: Callable[[list[int]], Crops]
@@ -125,13 +140,21 @@ class Context:
             return {ref.key: {"maps": _half(maps[layer], layer)} for layer, ref in missing.items()}
 
         layouts = {ref: self.features_layout(layer) for layer, ref in missing.items()}
-        self.fill(step, title, layouts, rows, self.runtime.batch or self.backbone.batch, compute)
+        batch = self.backbone.batch  # loads the weights: their seconds are no part of a row's
+        work = work_of("features", self.stages, list(missing))
+        self.fill(step, title, layouts, rows, self.runtime.batch or batch, compute, work=work)
 
 
 def stacked(crops: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
     """Rows of a crops entry from what the crop stage returns."""
     rgb, mask, A_crop_img = (np.stack(parts) for parts in zip(*crops, strict=True))
     return {"rgb": rgb, "mask": mask, "A_crop_img": A_crop_img}
+
+
+def _mesh_bytes(model: ObjectModel) -> int:
+    mesh = model.mesh
+    arrays = (mesh.vertices, mesh.faces, mesh.colours, mesh.uv, mesh.texture)
+    return sum(array.nbytes for array in arrays if array is not None)
 
 
 def _half(maps: torch.Tensor, layer: int) -> np.ndarray:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from pipeline.checkpoints import NotFetched
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.queries import QueryNodes
+from pipeline.graph.rates import work_of
 from pipeline.graph.templates import TemplateNodes
 from pipeline.store import Layout, Ref
 
@@ -18,7 +20,11 @@ TEMPLATE_PIXEL_BYTES = 7  # rgb and float32 depth, before compression
 
 @dataclass(frozen=True)
 class Node:
-    """One entry as a plan shows it. ``cost``: views to render, images to pass through the backbone, poses to solve."""
+    """One entry as a plan shows it. ``cost``: views to render, images to pass through the backbone, poses to solve.
+
+    Of what is not cached: ``passes``, images through the backbone, counted once for all layers of one pass, and
+    ``seconds`` as measured before, None where they are not known. ``sized``: whether ``nbytes`` is known beforehand.
+    """
 
     step: str
     of: str
@@ -26,6 +32,9 @@ class Node:
     state: str
     nbytes: int
     cost: str
+    passes: int = 0
+    seconds: float | None = 0.0
+    sized: bool = True
 
 
 @dataclass(eq=False)
@@ -40,77 +49,109 @@ class Plan:
     poses: PoseNodes
     detections: DetectionNodes
 
-    def nodes(self) -> list[Node]:
-        """All nodes in the order of the route."""
-        nodes = [node for obj_id in self.run.object_ids for node in self._of_object(obj_id)]
+    def nodes(self) -> Iterator[Node]:
+        """All nodes in the order of the route. Raises NotFetched at the first whose key weights decide."""
+        unknown: NotFetched | None = None
+        for obj_id in self.run.object_ids:
+            yield from self._views_of_object(obj_id)
+            try:
+                yield from self._features_of_object(obj_id)
+            except NotFetched as fault:
+                unknown = fault
+        if unknown is not None:
+            raise unknown
         if self.detections.proposals:
-            nodes += self._of_proposals(self.detections.proposals)
+            yield from self._of_proposals(self.detections.proposals)
         if not self.detections.known:
-            return nodes
+            return
         for image in self.run.image_ids:
-            nodes += self._of_image(image)
+            yield from self._of_image(image)
         for group, targets in self.poses.groups.items():
-            of = f"scene {group[0]} object {group[1]}"
-            nodes.append(self._node("poses", of, self.poses.poses(group), 0, f"{len(targets)} targets"))
-        return nodes
+            of, n = f"scene {group[0]} object {group[1]}", len(targets)
+            work = work_of("poses", self.run.stages, rows=self._views(group[1]))
+            yield self._node("poses", of, self.poses.poses(group), None, f"{n} targets", work, n)
 
-    def _of_object(self, obj_id: int) -> list[Node]:
+    def _views(self, obj_id: int) -> int:
+        return len(self.run.stages.render.cameras(self.run.model(obj_id).mesh)[1])
+
+    def _views_of_object(self, obj_id: int) -> Iterator[Node]:
         _, T_cam_obj, (h, w) = self.run.stages.render.cameras(self.run.model(obj_id).mesh)
-        n, of = len(T_cam_obj), f"object {obj_id}"
+        n, of, stages = len(T_cam_obj), f"object {obj_id}", self.run.stages
         size = n * (h * w * TEMPLATE_PIXEL_BYTES + T_cam_obj[0].nbytes)
-        nodes = [
-            self._node("templates", of, self.templates.templates(obj_id), size, f"{n} views"),
-            self._node(
-                "template crops", of, self.templates.crops(obj_id), _size(self.run.crops_layout(), n), f"{n} crops"
-            ),
-        ]
-        nodes += [
-            self._features("template features", f"{of} layer {layer}", self.templates.features(obj_id, layer), layer, n)
-            for layer in self.run.stages.layers
-        ]
-        return nodes + [
-            self._node("fits", f"{of} {fit.kind}", self.templates.fitted(obj_id, fit), 0, f"{n} templates")
-            for fit in self.run.stages.fits
-        ]
+        ref, crops = self.templates.templates(obj_id), self.templates.crops(obj_id)
+        yield self._node("templates", of, ref, size, f"{n} views", work_of("templates", stages), n)
+        size, work = _size(self.run.crops_layout(), n), work_of("template crops", stages)
+        yield self._node("template crops", of, crops, size, f"{n} crops", work, n)
 
-    def _of_image(self, image: ImageId) -> list[Node]:
+    def _features_of_object(self, obj_id: int) -> Iterator[Node]:
+        n, of, stages = self._views(obj_id), f"object {obj_id}", self.run.stages
+        refs = {layer: self.templates.features(obj_id, layer) for layer in stages.layers}
+        yield from self._features("template features", of, refs, n)
+        missing = [fit for fit in stages.fits if not self.run.store.complete(self.templates.fitted(obj_id, fit))]
+        for fit in stages.fits:
+            size = fit.array_bytes(stages.extract.feature_shape(fit.layer)[0], n)
+            share = 1 / len(missing) if missing else 0
+            ref, work = self.templates.fitted(obj_id, fit), work_of("fits", stages)
+            yield self._node("fits", f"{of} {fit.kind}", ref, size, f"{n} templates", work, share)
+
+    def _of_image(self, image: ImageId) -> Iterator[Node]:
         n, of = len(self.queries.of_image[image]), f"scene {image[0]} image {image[1]}"
-        nodes = [
-            self._node("query crops", of, self.queries.crops(image), _size(self.run.crops_layout(), n), f"{n} crops")
-        ]
-        return nodes + [
-            self._features("query features", f"{of} layer {layer}", self.queries.features(image, layer), layer, n)
-            for layer in self.run.stages.layers
-            if n
-        ]
+        size, work = _size(self.run.crops_layout(), n), work_of("query crops", self.run.stages)
+        yield self._node("query crops", of, self.queries.crops(image), size, f"{n} crops", work, n)
+        if n:
+            refs = {layer: self.queries.features(image, layer) for layer in self.run.stages.layers}
+            yield from self._features("query features", of, refs, n)
 
-    def _of_description(self, described: ProposalNodes, obj_id: int) -> Node:
-        n = len(self.run.stages.render.cameras(self.run.model(obj_id).mesh)[1])
-        size = _size(described.run.features_layout(described.detector.describe_layer), n)
-        ref, of = described.template_features(obj_id), f"object {obj_id}, to be detected by"
-        return self._node("template features", of, ref, size, f"{n} images through the backbone")
+    def _of_description(self, described: ProposalNodes, obj_id: int) -> Iterator[Node]:
+        n, layer = self._views(obj_id), described.detector.describe_layer
+        refs = {layer: described.template_features(obj_id)}
+        nodes = self._features("template features", f"object {obj_id}, to be detected by", refs, n, described.run)
+        own = {self.templates.features(obj_id, layer) for layer in self.run.stages.layers}
+        return (node for node in nodes if node.ref not in own)
 
-    def _of_proposals(self, described: ProposalNodes) -> list[Node]:
+    def _of_proposals(self, described: ProposalNodes) -> Iterator[Node]:
         """What detections are computed from, and they themselves."""
-        nodes = [self._of_description(described, obj_id) for obj_id in self.run.object_ids]
+        for obj_id in self.run.object_ids:
+            yield from self._of_description(described, obj_id)
         for image in self.run.image_ids:
             of = f"scene {image[0]} image {image[1]}"
-            nodes.append(self._node("proposals", of, described.proposals(image), 0, "1 image through the proposer"))
-            features = described.features(image)
-            nodes.append(self._node("proposal features", of, features, 0, "its proposals through the backbone"))
+            ref = described.proposals(image)
+            yield self._node("proposals", of, ref, None, "1 image through the proposer")
+            ref = described.features(image)
+            yield self._node("proposal features", of, ref, None, "its proposals through the backbone")
         follows = "query crops, query features, poses and scores follow from them and are not listed"
-        of = f"{len(self.run.targets)} targets"
-        return [*nodes, self._node("detections", of, self.detections.ref, 0, follows)]
+        yield self._node("detections", f"{len(self.run.targets)} targets", self.detections.ref, None, follows)
 
-    def _features(self, step: str, of: str, ref: Ref, layer: int, rows: int) -> Node:
-        return self._node(
-            step, of, ref, _size(self.run.features_layout(layer), rows), f"{rows} images through the backbone"
-        )
+    def _features(
+        self, step: str, of: str, refs: Mapping[int, Ref], rows: int, run: Context | None = None
+    ) -> Iterator[Node]:
+        """A node for every layer; those that are missing come of one pass, which the first of them pays for."""
+        run = run or self.run
+        missing = [layer for layer, ref in refs.items() if not run.store.complete(ref)]
+        work = work_of("features", run.stages, missing) if missing else ""
+        for layer, ref in refs.items():
+            pays = rows if layer in missing[:1] else 0
+            size, cost = _size(run.features_layout(layer), rows), f"{rows} images through the backbone"
+            yield self._node(step, f"{of} layer {layer}" if run is self.run else of, ref, size, cost, work, pays, pays)
 
-    def _node(self, step: str, of: str, ref: Ref, nbytes: int, cost: str) -> Node:
-        state = self.run.store.state(ref)
+    def _node(
+        self,
+        step: str,
+        of: str,
+        ref: Ref,
+        nbytes: int | None,
+        cost: str,
+        work: str = "",
+        rows: float = 1,
+        passes: int = 0,
+    ) -> Node:
+        """``nbytes`` None: not known beforehand; ``work`` "": seconds nobody measures."""
         stored = self.run.store.size(ref)
-        return Node(step, of, ref, state, nbytes if stored is None else stored, "" if state == "cached" else cost)
+        if stored is not None:
+            return Node(step, of, ref, "cached", stored, "")
+        seconds = self.run.rates.seconds(work, rows) if work and rows else (0.0 if not rows else None)
+        state = self.run.store.state(ref)
+        return Node(step, of, ref, state, nbytes or 0, cost, passes, seconds, nbytes is not None)
 
 
 def _size(layouts: Mapping[str, Layout], rows: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -9,6 +10,7 @@ from functools import cached_property, lru_cache
 from pipeline.errors import NoPose
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import Found, QueryNodes
+from pipeline.graph.rates import work_of
 from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_of, record_of
@@ -101,7 +103,7 @@ class PoseNodes:
 
     def _make_poses(self, group: tuple[int, int], advance: Callable[[int], None]) -> None:
         ref, (_, obj_id) = self.poses(group), group
-        bank = self.templates.bank(obj_id)
+        bank, began = self.templates.bank(obj_id), time.perf_counter()
         answers: list[Answer] = []
         for target in self.groups[group]:
             answers += self._answers(target, bank)
@@ -110,6 +112,9 @@ class PoseNodes:
         document = {"answers": [record_of(answer) for answer in answers]}
         self.run.store.put_document(ref, document, rows=len(answers), time_s=seconds)
         self.run.tally.add("poses", computed=len(answers), time_s=seconds)
+        templates = self.run.store.read(self.templates.templates(obj_id)).rows
+        work = work_of("poses", self.run.stages, rows=templates)
+        self.run.rates.note(work, len(self.groups[group]), time.perf_counter() - began)
 
     def _detections(self, target: Target) -> list[tuple[int, Detection]]:
         return self.queries.of_target.get((target.scene_id, target.im_id, target.obj_id), [])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,6 +15,7 @@ from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.detections import DetectionNodes
+from pipeline.graph.rates import work_of
 from pipeline.items.views import Crops, Detection, Geometry
 from pipeline.route import Query
 from pipeline.spec import digest
@@ -89,6 +91,7 @@ class QueryNodes:
         if self.run.store.complete(ref):
             self.run.tally.add("query crops", reused=self.run.store.read(ref).rows)
             return self.found(image)
+        began = time.perf_counter()
         crops, document = self._cropped(image)
         if not crops:
             self.run.store.put_document(ref, document, rows=0)
@@ -99,6 +102,7 @@ class QueryNodes:
             return {ref.key: {name: values[rows] for name, values in arrays.items()}}
 
         self.run.fill("query crops", "", {ref: self.run.crops_layout()}, len(crops), len(crops), compute, document)
+        self.run.rates.note(work_of("query crops", self.run.stages), len(crops), time.perf_counter() - began)
         return self.found(image)
 
     def _cropped(self, image: ImageId) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], dict[str, object]]:

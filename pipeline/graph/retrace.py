@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import UInt8
@@ -11,7 +10,7 @@ from jaxtyping import UInt8
 from pipeline.errors import NoPose
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
-from pipeline.graph.templates import StoredBank, TemplateNodes
+from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.route import Hypothesis, trace_pose
@@ -29,18 +28,11 @@ class Retraced:
 
 @dataclass(eq=False)
 class Retracer:
-    """Traces answers of one run again; an object's templates are read once."""
+    """Traces answers of one run again."""
 
     templates: TemplateNodes
     queries: QueryNodes
     poses: PoseNodes
-
-    @cached_property
-    def _bank(self):
-        return lru_cache(maxsize=2)(self._read_bank)
-
-    def _read_bank(self, obj_id: int) -> StoredBank:
-        return self.templates.bank(obj_id)
 
     def __call__(self, answer: Answer) -> Retraced | None:
         """How an answer came about; None where there is no crop to show."""
@@ -53,7 +45,7 @@ class Retracer:
             return None
         query_rgb = run.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
         try:
-            best = trace_pose(run.stages, self.poses.query(found)[0], self._bank(answer.obj_id)).best
+            best = trace_pose(run.stages, self.poses.query(found)[0], self.templates.bank(answer.obj_id)).best
         except NoPose:
             return Retraced(detection, query_rgb)
         crops = run.store.read(self.templates.crops(answer.obj_id))

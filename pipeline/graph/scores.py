@@ -24,6 +24,7 @@ from pipeline.items.scores import PoseErrors, TemplateError, errors_of, errors_r
 from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
 from pipeline.scoring import SCORES_VERSION, Scored, Scorer, truth_digest
+from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
 Instance = tuple[int, int, int, int]
@@ -74,7 +75,16 @@ class ScoreNodes:
         """The entry as a plan shows it."""
         state, targets = self.run.store.state(self.ref), len(self.run.targets)
         cost = "" if state == "cached" else f"{targets} targets to hold against ground truth"
-        return Node("scores", f"{targets} targets", self.ref, state, self.run.store.size(self.ref) or 0, cost)
+        size, seconds = self.run.store.size(self.ref), self.run.rates.seconds(self._work, targets)
+        if size is not None:
+            return Node("scores", f"{targets} targets", self.ref, state, size, cost)
+        return Node("scores", f"{targets} targets", self.ref, state, 0, cost, seconds=seconds, sized=False)
+
+    @property
+    def _work(self) -> str:
+        """What decides the seconds of a target."""
+        how = [self.scorer.vsd_delta_mm, not self.scorer.no_vsd, self.retrace is not None, self.scorer.models]
+        return digest(["scores", self.run.dataset.name, how])
 
     def judge(self, answers: Sequence[Answer]) -> Judged:
         """Scores of the run's answers, read or made."""
@@ -111,6 +121,7 @@ class ScoreNodes:
         if self.retrace:
             document["correspondences"] = self._correspondence_errors(answers, of)
         self.run.store.put_document(self.ref, document, rows=len(answers), time_s=time.perf_counter() - start)
+        self.run.rates.note(self._work, len(self.run.targets), time.perf_counter() - start)
 
     def _correspondence_errors(
         self, answers: Sequence[Answer], of: Sequence[PoseErrors | None]

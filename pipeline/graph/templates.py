@@ -12,6 +12,7 @@ import torch
 
 from pipeline.errors import DzopError
 from pipeline.graph.context import Context, stacked
+from pipeline.graph.rates import work_of
 from pipeline.items.features import TemplateCells
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.route import TemplateView
@@ -50,9 +51,13 @@ class StoredBank:
 
 @dataclass(eq=False)
 class TemplateNodes:
-    """Entries of objects. Methods without a verb name entries; ``make_*`` compute what is missing."""
+    """Entries of objects. Methods without a verb name entries; ``make_*`` compute what is missing.
+
+    ``views``: whole templates of an object that a bank keeps for the next query.
+    """
 
     run: Context
+    views: int = 64
 
     @cached_property
     def templates(self) -> Callable[[int], Ref]:
@@ -92,8 +97,9 @@ class TemplateNodes:
             "T_cam_obj": Layout((4, 4), "float64"),
         }
         self.run.fill(
-            "templates", f"render object {obj_id}", {ref: layout}, count, VIEWS_PER_BATCH, compute, {"K": K.tolist()}
-        )
+            "templates", f"render object {obj_id}", {ref: layout}, count, VIEWS_PER_BATCH, compute, {"K": K.tolist()},
+            work=work_of("templates", self.run.stages),
+        )  # fmt: skip
         return count
 
     def read_views(self, obj_id: int, rows: Sequence[int] | None = None) -> Templates:
@@ -116,8 +122,9 @@ class TemplateNodes:
             return {ref.key: stacked(crops)}
 
         self.run.fill(
-            "template crops", f"crop object {obj_id}", {ref: self.run.crops_layout()}, count, CROPS_PER_BATCH, compute
-        )
+            "template crops", f"crop object {obj_id}", {ref: self.run.crops_layout()}, count, CROPS_PER_BATCH, compute,
+            work=work_of("template crops", self.run.stages),
+        )  # fmt: skip
 
     def make_features(self, obj_id: int, count: int, layers: Sequence[int]) -> None:
         """Extract what is missing of an object's template features."""
@@ -143,7 +150,8 @@ class TemplateNodes:
 
     def make_fitted(self, obj_id: int) -> None:
         """Fit what is missing to an object's templates; what a fit stands on comes before it."""
-        cells = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer))
+        cells, began = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer)), time.perf_counter()
+        missing = [fit for fit in self.run.stages.fits if not self.run.store.complete(self.fitted(obj_id, fit))]
         for fit in self.run.stages.fits:
             ref, start = self.fitted(obj_id, fit), time.perf_counter()
             if self.run.store.complete(ref):
@@ -153,6 +161,8 @@ class TemplateNodes:
             arrays = {name: array.numpy() for name, array in fit(cells(fit.layer), base).items()}
             self.run.tally.add("fits", time_s=time.perf_counter() - start)
             self._keep(ref, arrays)
+        if missing and len(missing) == len(self.run.stages.fits):
+            self.run.rates.note(work_of("fits", self.run.stages), 1, time.perf_counter() - began)
 
     def _keep(self, ref: Ref, arrays: dict[str, np.ndarray]) -> None:
         """Store arrays of any shapes as an entry of one row."""
@@ -194,14 +204,18 @@ class TemplateNodes:
         refs = [self.features(obj_id, layer) for obj_id in self.run.object_ids for layer in self.run.stages.layers]
         return sum(self.run.store.size(ref) or 0 for ref in refs)
 
-    def bank(self, obj_id: int) -> StoredBank:
-        """An object's templates for the online route."""
+    @cached_property
+    def bank(self) -> Callable[[int], StoredBank]:
+        """An object's templates for the online route; those of one object stay in memory, whoever asks."""
+        return lru_cache(maxsize=1)(self._bank)
+
+    def _bank(self, obj_id: int) -> StoredBank:
         layers = self.run.stages.layers
         features = {layer: self.run.store.read(self.features(obj_id, layer)) for layer in layers}
         crops, templates = self.run.store.read(self.crops(obj_id)), self.run.store.read(self.templates(obj_id))
         K = np.array(templates.document["K"])
 
-        @lru_cache(maxsize=64)
+        @lru_cache(maxsize=self.views)
         def view(index: int) -> TemplateView:
             return TemplateView(
                 features={layer: self.run.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()},

@@ -17,6 +17,9 @@ SALIENCY_LAYER = -1
 CLASS_TOKEN_LAYER = -2
 """Where a transformer gives its class token, (c 1 1)."""
 
+PSEUDO_LAYERS = f"{SALIENCY_LAYER} (saliency) or {CLASS_TOKEN_LAYER} (class token)"
+"""Both, as messages name them."""
+
 
 @dataclass(frozen=True, eq=False)
 class FusedPair:

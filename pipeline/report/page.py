@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,7 +20,7 @@ from pipeline.items.scores import Scores
 from pipeline.report import figures, tables
 from pipeline.report.families import Family, base_of, families, is_oracle, scored_by
 from pipeline.report.figures import Figure, ar_interval, ar_name
-from pipeline.report.rows import Row
+from pipeline.report.rows import Row, standing_failures
 from pipeline.report.tables import Table, run_name
 from pipeline.whole import write_whole
 
@@ -172,11 +173,13 @@ def write_report(rows: Sequence[Row], out: Path) -> Report:
     """Write the page of all rows, its figures and tables to ``out/report``; a reader sees a whole page or the old."""
     folder = out / FOLDER
     sections = sections_of(rows)
-    failed = [row for row in rows if row.status == "failed"]
+    failed = standing_failures(rows)
     pictures = _Pictures(out)
     parts = []
-    for section in sections:
-        drawn, told = section.figures(), section.tables()
+    made = [(section, section.figures(), section.tables()) for section in sections]
+    for old in ("figures", "tables"):  # those of runs that are gone must not lie beside this page
+        shutil.rmtree(folder / old, ignore_errors=True)
+    for section, drawn, told in made:
         _write_files(folder, section, drawn, told)
         galleries = [(section.name(row), pictures.of(row)) for row in section.galleries()]
         theirs = tables.published_column(section.dataset)
@@ -188,7 +191,7 @@ def write_report(rows: Sequence[Row], out: Path) -> Report:
         parts=parts,
         failed=failed,
         published=published,
-        runs=len(rows),
+        runs=sum(row.status == "done" for row in rows) + len(failed),
         left_out=pictures.left_out,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
@@ -252,12 +255,18 @@ def _template() -> jinja2.Template:
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["breakable"] = _breakable
+    environment.filters["two_lines"] = _two_lines
     return environment.get_template("page.html.j2")
 
 
 def _breakable(text: str) -> Markup:
     """A name that may go on in the next line after its dots, underscores and equals signs."""
     return Markup(re.sub(r"([._=])", r"\1<wbr>", str(escape(text))))
+
+
+def _two_lines(text: str) -> Markup:
+    """A figure above its interval: a table of many columns is then no wider than a page."""
+    return Markup(str(escape(text)).replace(" (", "<br>("))
 
 
 def _write_files(folder: Path, section: Section, drawn: dict[str, list[Figure]], told: dict[str, list[Table]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -72,6 +72,21 @@ class Row:
 def row_id(config: Mapping[str, Any]) -> str:
     """Identity of a run: its configuration without what changes no answer."""
     return digest({name: value for name, value in config.items() if name not in UNTOLD})[:16]
+
+
+def standing_failures(rows: Sequence[Row]) -> list[Row]:
+    """Failed rows, without those whose job has ended well since: the same but for where its weights lie."""
+    done = {digest(_placeless(row.config)): row.at for row in sorted(rows, key=lambda r: r.at) if row.status == "done"}
+    failed = [row for row in rows if row.status == "failed"]
+    return [row for row in failed if done.get(digest(_placeless(row.config)), "") <= row.at]
+
+
+def _placeless(value: Any) -> Any:
+    """A configuration without what changes no answer, and without places of weights, which have a revision beside."""
+    if not isinstance(value, Mapping):
+        return value
+    left_out = {*UNTOLD, "revision"} if "revision" in value or "method" in value else set()
+    return {name: _placeless(item) for name, item in value.items() if name not in left_out}
 
 
 def row_path(out: Path, id_: str) -> Path:

@@ -174,3 +174,17 @@ def test_rows_on_disk_make_the_page(rows, tmp_path):
     assert "failed: cluster.count=-1" in report.summary
     with pytest.raises(BadInput, match="needs the rows of runs"):
         read_rows(tmp_path / "empty")
+
+
+def test_files_of_runs_that_are_gone_do_not_lie_beside_a_new_page(rows, tmp_path):
+    page(rows, tmp_path)
+    drawn = {path.name for path in (tmp_path / "report").rglob("ablation_cluster_count.*")}
+    assert {"ablation_cluster_count.csv", "ablation_cluster_count.tex"} <= drawn
+    page(rows[:1], tmp_path)
+    assert not list((tmp_path / "report").rglob("ablation_cluster_count.*"))
+    assert list((tmp_path / "report" / "tables").rglob("runs.csv"))
+
+
+def test_a_table_of_many_columns_has_intervals_below_their_figures(built):
+    _, text = built
+    assert re.search(r"<td>0\.\d{3}<br>\(0\.\d{3} to 0\.\d{3}\)</td>", text)

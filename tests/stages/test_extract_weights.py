@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from huggingface_hub.errors import LocalEntryNotFoundError
 from make_sd15 import write_folder
 from safetensors.torch import load_file, save_file
 
+from pipeline.checkpoints import is_local
 from pipeline.errors import BadInput
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
-from pipeline.stages.extract.weights import alphas_cumprod, find, is_local
+from pipeline.stages.extract.weights import alphas_cumprod, find
 
 CPU = Runtime(device="cpu", batch=2)
 UNET = "unet/diffusion_pytorch_model.safetensors"
@@ -143,6 +145,12 @@ def test_a_hub_id_out_of_reach_says_what_to_do(monkeypatch: pytest.MonkeyPatch, 
     assert message.startswith("extract.weights: found 'someone/no-such-model', which is no local path")
     assert "give its local folder" in message
     assert "extract.weights: found 'no such/ id!'" in refusal("no such/ id!")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", _unreachable)
+    assert "was not fetched: ConnectError: no route, needs" in refusal("someone/no-such-model")
+
+
+def _unreachable(*args: object, **kwargs: object) -> None:
+    raise LocalEntryNotFoundError("Got: ConnectError: no route\nAn error happened while trying to locate the files")
 
 
 def test_a_missing_place_is_named(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from pipeline.functional import camera, rigid
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import NonNegative, PositiveFloat, Runtime, Spec, spec
+from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
 from pipeline.stages.extract.grid import CELLS, cells_of
 
 FINEST = max(CELLS.values())
@@ -46,6 +47,11 @@ class Coordinates(Spec):
         cells_of(layer)
         return self.channels, FINEST, FINEST
 
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As fitting.Sized: the points of a map's cells, float64, and the maps."""
+        maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
+        return Footprint(0, 0, 8 * FINEST**2 * (12 + 2 * self.channels) + maps, most=64)
+
     def load(self, runtime: Runtime) -> CoordinatesBackbone:
         """Nothing to load."""
         return CoordinatesBackbone(self, runtime)
@@ -55,7 +61,9 @@ class CoordinatesBackbone:
     """A Coordinates spec with its frequencies drawn."""
 
     def __init__(self, spec: Coordinates, runtime: Runtime) -> None:
-        self.device, self.batch = torch.device(runtime.torch_device()), runtime.batch or 64
+        self.device = torch.device(runtime.torch_device())
+        footprint = spec.footprint(tuple(CELLS), 0)
+        self.batch = runtime.batch or fitting_batch(footprint, runtime, self.device)
         self.spec = spec
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
@@ -23,9 +22,9 @@ from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
 from pipeline.stages.extract.decoder import Hook, block_count, decoder_maps, map_shape
+from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
 from pipeline.stages.extract.noise import NoiseMode, draw, noised
 
-_CPU_WORKING_BYTES = 1 << 30  # keeps all of SD 1.5 in float32 under 6 GB; larger batches gain nothing on a CPU
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
 
 
@@ -103,9 +102,21 @@ class DiffusionFeatures(Spec, ABC):
         device = torch.device(runtime.torch_device())
         model = self.load_model()
         placed = LoadedModel(_ready(model.unet, device), _ready(model.vae, device), model.prompt.to(device))
-        return DiffusionBackbone(
-            self, architecture, placed, runtime.batch or _fitting_batch(self, architecture, device)
+        working = _working(self, architecture, device.type)
+        batch = runtime.batch or fitting_batch(working, runtime, device)
+        return DiffusionBackbone(self, architecture, placed, batch)
+
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As fitting.Sized: the weights are counted on models without memory."""
+        from diffusers import AutoencoderKL, UNet2DConditionModel
+
+        a, working = self.architecture(), _working(self, self.architecture(), device)
+        _check(self, a, layers)
+        values = parameter_count(UNet2DConditionModel, a.unet) + parameter_count(
+            AutoencoderKL, a.vae, without="decoder"
         )
+        maps = maps_bytes([self.feature_shape(layer) for layer in layers])
+        return Footprint(values * _bytes_per_value(self), working.a_pass, working.a_crop + maps, working.most)
 
 
 class DiffusionBackbone:
@@ -187,14 +198,22 @@ def _check(spec: DiffusionFeatures, architecture: Architecture, layers: Sequence
         )
 
 
-def _fitting_batch(spec: DiffusionFeatures, architecture: Architecture, device: torch.device) -> int:
-    """Crops per pass from free memory, by the largest maps: the VAE's first level, the U-Net's first with its skips."""
-    bytes_per_value = 4 if spec.dtype == "float32" else 2
+def parameter_count(cls: Any, config: Mapping[str, Any], *, without: str = "") -> int:
+    """Values of a diffusers model, of all its parts but one if told so; nothing is set aside for them."""
+    with torch.device("meta"):
+        model = cls.from_config(dict(config))
+    return sum(p.numel() for name, p in model.named_parameters() if not without or not name.startswith(without))
+
+
+def _bytes_per_value(spec: DiffusionFeatures) -> int:
+    return 4 if spec.dtype == "float32" else 2
+
+
+def _working(spec: DiffusionFeatures, architecture: Architecture, device: str) -> Footprint:
+    """A pass by its largest maps: the VAE's first level, one by one on a CPU, and the U-Net's first with its skips."""
     latent_size = spec.input_size // architecture.vae_factor
-    unet = 60 * architecture.unet["block_out_channels"][0] * latent_size**2 * bytes_per_value
-    vae = 6 * architecture.vae["block_out_channels"][0] * spec.input_size**2 * bytes_per_value
-    if device.type == "cuda":
-        fitting = int(0.6 * torch.cuda.mem_get_info(device)[0]) // (vae + unet)
-    else:
-        fitting = min(psutil.virtual_memory().available // 4, _CPU_WORKING_BYTES) // unet
-    return max(1, min(fitting, _MOST_CROPS[device.type]))
+    unet = 60 * architecture.unet["block_out_channels"][0] * latent_size**2 * _bytes_per_value(spec)
+    vae = 6 * architecture.vae["block_out_channels"][0] * spec.input_size**2 * _bytes_per_value(spec)
+    if device == "cuda":
+        return Footprint(0, 0, unet + vae, _MOST_CROPS[device])
+    return Footprint(0, max(0, vae - unet), unet, _MOST_CROPS[device])

@@ -14,8 +14,9 @@ from pipeline.digests import file_digest
 from pipeline.errors import BadInput
 from pipeline.spec import Positive, digest, spec
 from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.stages.extract.loading import empty_model, without_decoder
 from pipeline.stages.extract.noise import NoiseMode
-from pipeline.stages.extract.weights import alphas_cumprod, empty_model, without_decoder
+from pipeline.stages.extract.weights import alphas_cumprod
 
 FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
 PROMPT = (1, 1, 32)  # of zeros: the model knows no text

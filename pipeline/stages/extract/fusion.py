@@ -16,6 +16,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import Fraction, Runtime, Spec, spec
 from pipeline.stages.extract import Backbone, Extractor
 from pipeline.stages.extract.dinov2 import DinoV2
+from pipeline.stages.extract.fitting import Footprint, Sized, maps_bytes
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
 
@@ -112,6 +113,14 @@ class Fusion(Spec):
             raise BadInput("extract layer", found=layer, needed=needed)
         return pairs[layer]
 
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As fitting.Sized: both models, and the larger pass of the two with the maps of both. Unknown parts raise."""
+        first = _sized(self.first, "first").footprint(layers, crop_size, device)
+        second = _sized(self.second, "second").footprint([self.partner(k) for k in layers], crop_size, device)
+        maps = maps_bytes([self.feature_shape(layer) for layer in layers])
+        a_pass, a_crop = max(first.a_pass, second.a_pass), max(first.a_crop, second.a_crop) + maps
+        return Footprint(first.weights + second.weights, a_pass, a_crop, min(first.most, second.most))
+
     def load(self, runtime: Runtime) -> FusionBackbone:
         """Weights of both into memory. Raises BadInput for weights that are missing or of another class."""
         with _told_of("first"):
@@ -136,6 +145,14 @@ class FusionBackbone:
         first = self.first(crops, tuple(partner))
         second = self.second(crops, tuple(sorted(set(partner.values()))))
         return {k: side_by_side(first[k], second[other], alpha=self.spec.alpha) for k, other in partner.items()}
+
+
+def _sized(member: Extractor, name: str) -> Sized:
+    if not isinstance(member, Sized):
+        raise BadInput(
+            f"extract.{name}", found=f"{member.kind}, of unknown size", needed="an extractor with a footprint"
+        )
+    return member
 
 
 @contextmanager

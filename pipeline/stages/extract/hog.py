@@ -15,7 +15,10 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, Spec, spec
+from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
 from pipeline.stages.extract.grid import CELLS, cells_of
+
+_CROP_PX = 256  # a batch is sized for crops of this side
 
 
 @spec
@@ -49,6 +52,11 @@ class Hog(Spec):
         """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
         return self.channels, cells_of(layer), cells_of(layer)
 
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As fitting.Sized: gradients of three channels, energies by orientation, and the maps with their context."""
+        maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
+        return Footprint(0, 0, 4 * (28 + 3 * self.orientations) * crop_size**2 + maps, most=32)
+
     def load(self, runtime: Runtime) -> HogBackbone:
         """Nothing to load."""
         return HogBackbone(self, runtime)
@@ -58,7 +66,9 @@ class HogBackbone:
     """A Hog spec on a device."""
 
     def __init__(self, spec: Hog, runtime: Runtime) -> None:
-        self.spec, self.device, self.batch = spec, torch.device(runtime.torch_device()), runtime.batch or 32
+        self.spec, self.device = spec, torch.device(runtime.torch_device())
+        footprint = spec.footprint(tuple(CELLS), _CROP_PX)
+        self.batch = runtime.batch or fitting_batch(footprint, runtime, self.device)
 
     @torch.no_grad()
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:

@@ -12,7 +12,10 @@ from torch.nn.functional import interpolate, pixel_unshuffle
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, Spec, spec
-from pipeline.stages.extract.grid import cells_of
+from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
+from pipeline.stages.extract.grid import CELLS, cells_of
+
+_CROP_PX = 256  # a batch is sized for crops of this side
 
 
 @spec
@@ -32,6 +35,11 @@ class Pixels(Spec):
         """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
         return 3 * self.side**2, cells_of(layer), cells_of(layer)
 
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As fitting.Sized."""
+        maps = maps_bytes([self.feature_shape(layer) for layer in layers])
+        return Footprint(0, 0, 24 * crop_size**2 + maps, most=64)  # float32 colours, twice
+
     def load(self, runtime: Runtime) -> PixelsBackbone:
         """Nothing to load."""
         return PixelsBackbone(self, runtime)
@@ -41,7 +49,9 @@ class PixelsBackbone:
     """A Pixels spec on a device."""
 
     def __init__(self, spec: Pixels, runtime: Runtime) -> None:
-        self.spec, self.device, self.batch = spec, torch.device(runtime.torch_device()), runtime.batch or 64
+        self.spec, self.device = spec, torch.device(runtime.torch_device())
+        footprint = spec.footprint(tuple(CELLS), _CROP_PX)
+        self.batch = runtime.batch or fitting_batch(footprint, runtime, self.device)
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32; a cell that is larger than its colours holds their means."""

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from pipeline.spec import NonNegative, Positive, digest, spec
 from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
-from pipeline.stages.extract.weights import alphas_cumprod, empty_model, without_decoder
+from pipeline.stages.extract.loading import empty_model, without_decoder
+from pipeline.stages.extract.weights import alphas_cumprod
 
 _PROMPT_TOKENS = 77
 _GROUPS = 8  # of every group norm

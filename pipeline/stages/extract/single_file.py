@@ -13,21 +13,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pipeline.checkpoints import check_missing, tensor_shapes
 from pipeline.errors import BadInput
 from pipeline.stages.extract.diffusion import Architecture
-from pipeline.stages.extract.weights import (
-    alphas_cumprod,
-    check_latents,
-    check_missing,
+from pipeline.stages.extract.loading import (
     copy_weight,
     empty_model,
     empty_prompt,
     empty_text_encoder,
     fill,
     last_hidden_state,
-    tensor_shapes,
     without_decoder,
 )
+from pipeline.stages.extract.weights import alphas_cumprod, check_latents
 
 Shapes = Mapping[str, tuple[int, ...]]
 

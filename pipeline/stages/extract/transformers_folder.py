@@ -9,18 +9,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from pipeline.checkpoints import everywhere, fetched, is_local, pickled_in, read_json, shards
 from pipeline.errors import BadInput
-from pipeline.stages.extract.weights import (
-    FIELD,
-    check_missing,
-    fetched,
-    is_local,
-    pickled_in,
-    quiet_libraries,
-    read_json,
-    shards,
-    tensor_shapes,
-)
+from pipeline.stages.extract.weights import FIELD
+from pipeline.stages.pretrained import load_pretrained, quiet_libraries, whole_text
 
 CLASSES = {
     "vit": "ViTModel",
@@ -44,14 +36,15 @@ class Architecture:
     registers: int
 
 
-def find(weights: str, revision: str | None, model_types: tuple[str, ...]) -> TransformersFolder:
-    """What lies at a hub id or in a local folder. Raises BadInput."""
+def find(weights: str, revision: str | None, model_types: tuple[str, ...], name: str) -> TransformersFolder:
+    """What lies at a hub id or in a local folder. Raises BadInput; ``name``: that of the field below ``weights``."""
     if not is_local(weights):
-        return TransformersFolder(fetched(weights, revision, _PATTERNS), model_types)
+        return TransformersFolder(fetched(weights, revision, _PATTERNS, field=FIELD, name=name), model_types)
     path = Path(weights).expanduser()
     if not path.is_dir():
         found = f"{weights!r}, which is {'a file' if path.exists() else 'not there'}"
-        raise BadInput(FIELD, found=found, needed="a folder as save_pretrained writes it, or a hub id")
+        needed = "a folder as save_pretrained writes it, or a hub id" + everywhere(name)
+        raise BadInput(FIELD, found=found, needed=needed)
     return TransformersFolder(path, model_types)
 
 
@@ -81,30 +74,10 @@ class TransformersFolder:
 
     def model(self, dtype: torch.dtype) -> nn.Module:
         """The backbone. Raises BadInput for weights that are missing or do not fit the config."""
-        import transformers
-        from safetensors import SafetensorError
-
         self._config()
         tensors = [path for path in self._tensors() if path.suffix == ".safetensors"]
-        for path in tensors:
-            tensor_shapes(path)
-        cls: Any = getattr(transformers, CLASSES[self._model_type()])
-        options = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
-        options["ignore_mismatched_sizes"] = True  # told below, by name
-        if self._model_type() == "vit":
-            options["add_pooling_layer"] = False
-        try:
-            with quiet_libraries():
-                model, told = cls.from_pretrained(str(self.root), **options)
-        except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
-            raise BadInput(tensors[0], found=_text(error), needed="weights that fit config.json") from None
-        if told["mismatched_keys"]:
-            name, stored, needed = min(told["mismatched_keys"])
-            raise BadInput(
-                f"{tensors[0]}, tensor {name}", found=tuple(stored), needed=f"{tuple(needed)}, as config.json says"
-            )
-        check_missing(sorted(told["missing_keys"]), tensors[0])
-        return model.to(dtype)
+        options = {"add_pooling_layer": False} if self._model_type() == "vit" else {}
+        return load_pretrained(CLASSES[self._model_type()], self.root, tensors, **options).to(dtype)
 
     @property
     def _json(self) -> Path:
@@ -133,7 +106,7 @@ class TransformersFolder:
             with quiet_libraries():
                 return cls.from_dict(read_json(self._json))
         except Exception as error:  # what a wrong value raises differs between versions of the library
-            raise BadInput(self._json, found=_text(error), needed=f"the fields of a {cls.__name__}") from None
+            raise BadInput(self._json, found=whole_text(error), needed=f"the fields of a {cls.__name__}") from None
 
     def _tensors(self) -> list[Path]:
         """One file of weights, or an index and its shards."""
@@ -145,8 +118,3 @@ class TransformersFolder:
         found = f"only {', '.join(pickled)}" if pickled else "no such file"
         needed = "safetensors: convert it (save_pretrained), or name a revision of the hub that has them"
         raise BadInput(self.root / _SINGLE, found=found, needed=needed if pickled else f"the weights; {needed}")
-
-
-def _text(error: Exception) -> str:
-    """All of an error's text on one line; the first line alone often names no value."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -11,28 +11,29 @@ cells would misplace them by up to (patch - stride) / 2 pixels.
 
 from __future__ import annotations
 
+import math
 from abc import ABC
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pipeline.checkpoints import tensor_shapes
 from pipeline.digests import files_digest
 from pipeline.errors import BadInput
 from pipeline.functional.binning import bin_count, log_binned
-from pipeline.items.features import CLASS_TOKEN_LAYER, SALIENCY_LAYER, FeatureMaps
+from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
 from pipeline.stages.extract.diffusion import network_image
+from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
 from pipeline.stages.extract.transformer import Facet, block_tokens, embedded, framed, standardised
 from pipeline.stages.extract.transformers_folder import Architecture, TransformersFolder, find
 
-_CPU_WORKING_BYTES = 1 << 30
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
 _LIVE_MAPS = 24  # maps as wide as the model that are alive at once in a block: projections, attention, its MLP
 
@@ -68,7 +69,7 @@ class VitFeatures(Spec, ABC):
     @cached_property
     def source(self) -> TransformersFolder:
         """The weights, found (and fetched, for a hub id). Raises BadInput."""
-        return find(self.weights, self.revision, self.model_types)
+        return find(self.weights, self.revision, self.model_types, self.kind.partition(".")[2])
 
     @cached_property
     def architecture(self) -> Architecture:
@@ -115,7 +116,15 @@ class VitFeatures(Spec, ABC):
         _check(self, ())
         device = torch.device(runtime.torch_device())
         model = self.source.model(getattr(torch, self.dtype)).eval().requires_grad_(False).to(device)
-        return VitBackbone(self, model, device, runtime.batch or _fitting_batch(self, device))
+        batch = runtime.batch or fitting_batch(_working(self, device.type), runtime, device)
+        return VitBackbone(self, model, device, batch)
+
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As fitting.Sized: the weights are counted in the headers of their files."""
+        paths = [path for path in self.source.files.values() if path.suffix == ".safetensors"]
+        values = sum(math.prod(shape) for path in paths for shape in tensor_shapes(path).values())
+        maps = maps_bytes([self.feature_shape(layer) for layer in layers])
+        return Footprint(values * _bytes_per_value(self), 0, _working(self, device).a_crop + maps, _MOST_CROPS[device])
 
 
 class VitBackbone:
@@ -168,8 +177,7 @@ def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
     a, last = spec.architecture, spec.architecture.depth - 1
     for layer in layers:
         if not 0 <= layer <= last and layer not in (SALIENCY_LAYER, CLASS_TOKEN_LAYER):
-            others = f"{SALIENCY_LAYER} (saliency) or {CLASS_TOKEN_LAYER} (class token)"
-            needed = f"0..{last}, the transformer's {a.depth} blocks, {others}"
+            needed = f"0..{last}, the transformer's {a.depth} blocks, {PSEUDO_LAYERS}"
             raise BadInput("extract layer", found=layer, needed=needed)
     if a.patch % spec.stride_px:
         divisors = ", ".join(str(n) for n in range(1, a.patch + 1) if a.patch % n == 0)
@@ -183,14 +191,12 @@ def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
         raise BadInput("extract.saliency_heads", found=found, needed=needed)
 
 
-def _fitting_batch(spec: VitFeatures, device: torch.device) -> int:
-    """Crops per pass from free memory, by what is alive within a block and the widest map that is kept."""
-    bytes_per_value = 4 if spec.dtype == "float32" else 2
+def _bytes_per_value(spec: VitFeatures) -> int:
+    return 4 if spec.dtype == "float32" else 2
+
+
+def _working(spec: VitFeatures, device: str) -> Footprint:
+    """A pass by what is alive within a block and the widest map that is kept."""
     cells = (spec.input_size // spec.stride_px) ** 2
     maps = _LIVE_MAPS + 2 * len(set(spec.binned)) * bin_count(spec.hierarchy)
-    crop = maps * spec.architecture.width * cells * bytes_per_value
-    if device.type == "cuda":
-        fitting = int(0.6 * torch.cuda.mem_get_info(device)[0]) // crop
-    else:
-        fitting = min(psutil.virtual_memory().available // 4, _CPU_WORKING_BYTES) // crop
-    return max(1, min(fitting, _MOST_CROPS[device.type]))
+    return Footprint(0, 0, maps * spec.architecture.width * cells * _bytes_per_value(spec), _MOST_CROPS[device])

@@ -1,11 +1,8 @@
-"""Weights of Stable Diffusion: found, checked, digested, loaded. safetensors only; nothing is ever unpickled."""
+"""Weights of Stable Diffusion: found, and their configs checked. safetensors only; nothing is ever unpickled."""
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,18 +12,24 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from pipeline.checkpoints import everywhere, fetched, is_local, one_line, pickled_in, read_json, shards
 from pipeline.errors import BadInput
 from pipeline.stages.extract.diffusion import Architecture
+from pipeline.stages.extract.loading import (
+    empty_model,
+    empty_prompt,
+    empty_text_encoder,
+    fill,
+    last_hidden_state,
+    without_decoder,
+)
 
 FIELD = "extract.weights"
-_PICKLES = (".bin", ".ckpt", ".pt", ".pth")
+_NAME = "stable_diffusion"  # below weights in the configuration
 _SCHEDULE = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 _SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
 _TOKENIZER_FILES = ("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
 _STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
-_ATTENTION_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
-_PORTION = 1 << 26  # values read before a file is mapped anew
-_BOS, _EOS = 49406, 49407  # of CLIP's vocabulary (Radford et al., ICML 2021)
 
 
 class Weights(Protocol):
@@ -54,15 +57,6 @@ class Weights(Protocol):
         ...
 
 
-def is_local(weights: str) -> bool:
-    """True for what looks like a path: it exists, begins as a path does, or ends like a file of weights."""
-    return (
-        weights.startswith(("/", "./", "../", "~"))
-        or weights.endswith((".safetensors", *_PICKLES))
-        or Path(weights).exists()
-    )
-
-
 def find(weights: str, revision: str | None) -> Weights:
     """What lies at a hub id, in a diffusers folder, or in one .safetensors file of the original layout."""
     from pipeline.stages.extract.single_file import SingleFile
@@ -71,9 +65,8 @@ def find(weights: str, revision: str | None) -> Weights:
         return DiffusersFolder(_download(weights, revision))
     path = Path(weights).expanduser()
     if not path.exists():
-        raise BadInput(
-            FIELD, found=f"{weights!r}, which does not exist", needed="a diffusers folder or a .safetensors file"
-        )
+        needed = "a diffusers folder or a .safetensors file" + everywhere(_NAME)
+        raise BadInput(FIELD, found=f"{weights!r}, which does not exist", needed=needed)
     if path.is_dir():
         return DiffusersFolder(path)
     if path.suffix != ".safetensors":
@@ -183,19 +176,6 @@ class DiffusersFolder:
         return model
 
 
-def shards(index: Path) -> list[Path]:
-    """The files that an index of sharded weights names. Raises BadInput."""
-    weight_map = read_json(index).get("weight_map")
-    if not isinstance(weight_map, dict) or not weight_map:
-        raise BadInput(index, found=f"weight_map {weight_map!r}", needed="the file of each tensor")
-    return sorted({index.parent / str(name) for name in weight_map.values()})
-
-
-def pickled_in(folder: Path) -> list[str]:
-    """Names of the files that would have to be unpickled."""
-    return sorted(path.name for path in folder.glob("*") if path.suffix in _PICKLES)
-
-
 def check_unet(config: Mapping[str, Any], where: Path) -> None:
     """Raises BadInput, naming the field, for a U-Net that is not that of Stable Diffusion 1.x or 2.x."""
     check_class(config, "UNet2DConditionModel", where)
@@ -247,175 +227,13 @@ def alphas_cumprod(scheduler: Mapping[str, Any], where: Path | None = None) -> F
         raise BadInput(where, found=one_line(error), needed="a schedule of betas that diffusers knows") from None
 
 
-def empty_prompt(text: str, where: Path, *, open_clip: bool, length: int) -> Int[Tensor, "1 l"]:
-    """Token ids of "" without a tokenizer: begin, end, padding. Raises BadInput for any other text.
-
-    Stable Diffusion 1.x pads CLIP's text with the end token, 2.x pads OpenCLIP's with 0.
-    """
-    if text:
-        raise BadInput(
-            "extract.prompt", found=f"{text!r} and no tokenizer at {where}", needed='"", or a diffusers folder with one'
-        )
-    padding = 0 if open_clip else _EOS
-    return torch.tensor([[_BOS, _EOS] + [padding] * (length - 2)])
-
-
-def empty_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
-    """A model of a diffusers class, its memory set aside and not yet written to. Raises BadInput."""
-    try:
-        with torch.device("meta"), quiet_libraries():
-            model = cls.from_config(dict(config)).to(dtype)
-    except (ValueError, TypeError, KeyError, IndexError, RuntimeError, NotImplementedError) as error:
-        raise BadInput(where, found=one_line(error), needed=f"a config of {cls.__name__}") from None
-    return model.to_empty(device="cpu")
-
-
-def empty_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Module, nn.Module]:
-    """A CLIPTextModel, and the part of it that holds the weights: itself, within a wrapper until transformers 5.6."""
-    from transformers import CLIPTextConfig, CLIPTextModel
-
-    try:
-        with quiet_libraries():
-            model: Any = CLIPTextModel(CLIPTextConfig.from_dict(dict(config)))
-    except (ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
-        raise BadInput(where, found=one_line(error), needed="a config of CLIPTextModel") from None
-    return model, getattr(model, "text_model", model)
-
-
-def current_name(name: str) -> str:
-    """A weight's name today: no wrapper around the text encoder; the VAE's attention as since diffusers 0.17."""
-    name = name.removeprefix("text_model.")
-    former = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
-    return former[1] + _ATTENTION_NAMES[former[2]] + former[3] if former else name
-
-
-def fill(model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = current_name) -> None:
-    """Weights from safetensors files into a model's own memory. Raises BadInput for ones that do not fit.
-
-    ``name_of``: the model's name of a stored tensor. A file stays mapped for some hundred megabytes only: what has been
-    read of it would count as a second copy.
-    """
-    from safetensors import safe_open
-
-    missing = dict(model.named_parameters())
-    for path in paths:
-        stored = {name: s for s in tensor_shapes(path) if (name := name_of(s)) is not None and name in missing}
-        for names in _portions(stored, missing):
-            with safe_open(str(path), framework="pt") as tensors, torch.no_grad():
-                for name in names:
-                    where = f"{path}, tensor {stored[name]}"
-                    copy_weight(tensors.get_tensor(stored[name]), missing.pop(name), where)
-    check_missing(sorted(missing), paths[0])
-
-
-def check_missing(names: Sequence[str], where: Path) -> None:
-    """Raises BadInput when weights are missing: diffusers and transformers would draw them at random."""
-    if names:
-        raise BadInput(where, found=f"no tensor for {names[0]} ({len(names)} missing)", needed="all weights")
-
-
-def _portions(names: Iterable[str], parameters: Mapping[str, nn.Parameter]) -> list[list[str]]:
-    portions: list[list[str]] = [[]]
-    size = 0
-    for name in names:
-        portions[-1].append(name)
-        size += parameters[name].numel()
-        if size > _PORTION:
-            portions.append([])
-            size = 0
-    return portions
-
-
-def copy_weight(value: Tensor, parameter: nn.Parameter, where: str) -> None:
-    """A stored weight into a model's memory. Raises BadInput for another shape."""
-    if value.numel() == parameter.numel() and value.ndim > parameter.ndim:
-        value = value.view(parameter.shape)  # 1x1 kernels that became matrices
-    if value.shape != parameter.shape:
-        raise BadInput(
-            where, found=f"shape {tuple(value.shape)}", needed=f"{tuple(parameter.shape)}, as the config says"
-        )
-    parameter.copy_(value)
-
-
-def last_hidden_state(text_encoder: nn.Module, ids: Int[Tensor, "1 l"]) -> Float[Tensor, "1 l d"]:
-    """The text encoder's answer after its final layer norm, float32."""
-    with torch.no_grad():
-        return text_encoder.float().eval()(ids)[0].clone()
-
-
-def without_decoder(vae: Any) -> nn.Module:
-    """The VAE with its encoder alone."""
-    vae.decoder, vae.post_quant_conv = None, None
-    return vae
-
-
-def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes from a safetensors header. Raises BadInput for a file that is broken or cut off."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(str(path), framework="pt") as tensors:
-            return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise BadInput(path, found=one_line(error), needed="a complete safetensors file") from None
-
-
-@contextmanager
-def quiet_libraries() -> Iterator[None]:
-    """Without the progress bars and remarks of diffusers and transformers while they read weights."""
-    from diffusers.utils import logging as diffusers_logging
-    from transformers.utils import logging as transformers_logging
-
-    libraries = (diffusers_logging, transformers_logging)
-    before = [library.get_verbosity() for library in libraries]
-    for library in libraries:
-        library.set_verbosity_error()
-        library.disable_progress_bar()
-    try:
-        yield
-    finally:
-        for library, verbosity in zip(libraries, before, strict=True):
-            library.set_verbosity(verbosity)
-            library.enable_progress_bar()
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object. Raises BadInput."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise BadInput(path, found=one_line(error), needed="valid JSON") from None
-    if not isinstance(value, dict):
-        raise BadInput(path, found=type(value).__name__, needed="a JSON object")
-    return value
-
-
-def one_line(error: Exception) -> str:
-    """The first line of an error's text, for a BadInput."""
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0][:200]
-
-
 def _download(hub_id: str, revision: str | None) -> Path:
     """Folder of the hub's files that are needed; the half-precision ones only where there are no others."""
     for variant in ("", ".fp16"):
-        folder = fetched(hub_id, revision, _patterns(variant))
+        folder = fetched(hub_id, revision, _patterns(variant), field=FIELD, name=_NAME)
         if any((folder / "unet").glob("*.safetensors")):
             break
     return folder
-
-
-def fetched(hub_id: str, revision: str | None, patterns: list[str]) -> Path:
-    """Local folder of the hub's files that match ``patterns``. Raises BadInput."""
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
-
-    try:
-        return Path(snapshot_download(hub_id, revision=revision, allow_patterns=patterns))
-    except (HfHubHTTPError, HFValidationError, OSError) as error:
-        found = f"{hub_id!r}, which is no local path and was not fetched: {one_line(error)}"
-        needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder"
-        raise BadInput(FIELD, found=found, needed=needed) from None
 
 
 def _patterns(variant: str) -> list[str]:

@@ -38,6 +38,10 @@ class Fit(Variant, Protocol):
         """The fit that this one stands on, of the same layer, if any."""
         ...
 
+    def array_bytes(self, channels: int, templates: int) -> int:
+        """What its own arrays take at most, for features of so many channels."""
+        ...
+
     def __call__(self, cells: TemplateCells, base: Fitted) -> dict[str, Tensor]:
         """Its own arrays, on the CPU, the same every time. Raises DzopError for features it cannot be fitted to."""
         ...

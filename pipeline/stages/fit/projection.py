@@ -32,6 +32,10 @@ class Projection(Spec):
         """Nothing but features."""
         return None
 
+    def array_bytes(self, channels: int, templates: int) -> int:
+        """Mean and axes."""
+        return 4 * channels * (1 + min(self.dim, channels))
+
     def __call__(self, cells: TemplateCells, base: Fitted) -> dict[str, Tensor]:
         """``mean`` (c) and ``axes`` (c k), k smaller than ``dim`` where the cells span no more."""
         mean, axes = principal_axes_in_blocks(cells.features.cpu(), dim=self.dim)

@@ -50,6 +50,10 @@ class Vocabulary(Spec):
         """The projection."""
         return self.projection
 
+    def array_bytes(self, channels: int, templates: int) -> int:
+        """Words, their idf and the templates' vectors."""
+        return 4 * self.count * (min(self.projection.dim, channels) + 1 + templates)
+
     def __call__(self, cells: TemplateCells, base: Fitted) -> dict[str, Tensor]:
         """``words`` (w d), ``idf`` (w) and unit vectors ``templates`` (n w); w is at most ``count``."""
         points = projected(cells.features.cpu(), base["mean"], base["axes"])

@@ -7,9 +7,9 @@ more. Faces are drawn from both sides.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import product
-from typing import ClassVar
+from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -197,15 +197,32 @@ def _directions(
     return px @ A[:, :2].T + A[:, 2]
 
 
-# keyed by identity; as many meshes as a dataset's scene may hold are kept for its other views
-@lru_cache(maxsize=32)
+# for a mesh's other views, as long as the mesh itself lives, and of no more meshes than a dataset's scene may hold
+_KEPT = 32
+_casters: WeakKeyDictionary[Mesh, _Caster] = WeakKeyDictionary()
+_surfaces: WeakKeyDictionary[Mesh, dict[float, _Surface]] = WeakKeyDictionary()
+
+
 def _caster(mesh: Mesh) -> _Caster:
-    return _Caster(mesh)
+    if mesh not in _casters:
+        _make_room(_casters)
+        _casters[mesh] = _Caster(mesh)
+    return _casters[mesh]
 
 
-@lru_cache(maxsize=32)
 def _surface(mesh: Mesh, crease_deg: float) -> _Surface:
-    return _Surface(mesh, crease_deg)
+    if mesh not in _surfaces:
+        _make_room(_surfaces)
+    of_mesh = _surfaces.setdefault(mesh, {})
+    if crease_deg not in of_mesh:
+        of_mesh.clear()
+        of_mesh[crease_deg] = _Surface(mesh, crease_deg)
+    return of_mesh[crease_deg]
+
+
+def _make_room(kept: WeakKeyDictionary[Mesh, Any]) -> None:
+    while len(kept) >= _KEPT:
+        kept.pop(next(iter(kept)), None)
 
 
 def _embree() -> tuple[type, type]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
@@ -15,6 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.bop.masks import encode
+from pipeline.checkpoints import tensor_shapes
 from pipeline.digests import files_digest
 from pipeline.functional.boxes import area, not_suppressed
 from pipeline.functional.camera import mask_bbox
@@ -70,6 +72,10 @@ class Sam(Spec):
         recipe = super().recipe() | {"weights": self.weights_digest}
         del recipe["revision"]
         return recipe
+
+    def weight_bytes(self) -> int:
+        """What the weights take in memory."""
+        return 4 * sum(math.prod(shape) for path in self.source.tensors for shape in tensor_shapes(path).values())
 
     def load(self, runtime: Runtime) -> SamProposing:
         """See Proposer."""

@@ -1,0 +1,124 @@
+"""What a user is told: of layers, of weights, of jobs that fail, of masks that are odd, and after Ctrl-C."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Ran, run_dzop
+from make_vit import write_vit
+from PIL import Image
+
+from pipeline.__main__ import _closing
+from pipeline.report.rows import read_rows, standing_failures
+from pipeline.synthetic.scenes import write_dataset
+
+SMALL = ("render.count=6", "render.size=64", "method=dzop", "extract=hog", "overlays=false", "gallery=0",
+         "runtime.progress=false", "runtime.device=cpu", "evaluate.vsd=false")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("messages") / "scene"
+    write_dataset(root, objects=1, images=1, seed=3, size_hw=(120, 160), per_image=1, progress=False)
+    return root
+
+
+@pytest.fixture
+def dzop(capsys, monkeypatch, tmp_path, scene):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str, flags: tuple[str, ...] = ()) -> Ran:
+        dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}")
+        return run_dzop(capsys, monkeypatch, *flags, *dataset, *SMALL, *arguments)
+
+    return run
+
+
+def test_only_layers_that_a_field_takes_are_offered(dzop, tmp_path):
+    weights = write_vit(tmp_path / "vit")
+    for field, value in (("match.layer", "40"), ("fuse.layers", "[40]")):
+        ran = dzop("extract=dino", f"weights.dino={weights}", "fuse.layers=[1]", "match.layer=1", f"{field}={value}")
+        assert f"error: {field}: found 40, needs 0.." in ran.err
+        assert ran.err.strip().endswith("blocks")
+
+
+@pytest.mark.parametrize(
+    ("choice", "field", "name"),
+    [
+        ("extract=stable_diffusion", "extract.weights", "stable_diffusion"),
+        ("extract=dino", "extract.weights", "dino"),
+        ("extract=dinov2", "extract.weights", "dinov2"),
+        ("detect=cnos", "detect.proposals.weights", "sam"),
+    ],
+)
+def test_weights_that_are_missing_are_told_with_the_field_that_sets_them_for_a_sweep(dzop, choice, field, name):
+    own = ("extract@detect.describe=hog", "detect.describe_layer=8") if name == "sam" else ()
+    ran = dzop(choice, *own, f"weights.{name}=./nowhere")
+    (line,) = ran.err.strip().splitlines()
+    assert line.startswith(f"error: {field}: found './nowhere'")
+    assert f"weights.{name}=FOLDER: for all methods" in line
+
+
+def test_a_failure_is_forgotten_once_its_job_has_ended_well_with_other_weights(dzop, tmp_path):
+    whole = write_vit(tmp_path / "vit")
+    jobs = ("extract=dino", "fuse.layers=[1]", "match.layer=1", "cluster.count=3,4")
+    assert dzop(*jobs, "weights.dino=./nowhere", flags=("-m",)).status == 1
+    rows = read_rows(tmp_path / "results")
+    assert [row.config["cluster"]["count"] for row in standing_failures(rows)] == [3, 4]
+    assert dzop(*jobs[:3], "cluster.count=4", f"weights.dino={whole}").status == 0
+    rows = read_rows(tmp_path / "results")
+    assert [row.config["cluster"]["count"] for row in standing_failures(rows)] == [3]
+
+
+def test_a_sweep_ends_with_a_line_that_can_be_read(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["dzop", "-m", "dataset=lmo", "a=1,2,3,4,5"])
+    failed = [(["dataset=lmo", f"a={n}"], "weights: found nothing") for n in range(5)]
+    assert _closing(failed[:2]) == "a=0, a=1 (weights: found nothing)"
+    assert _closing(failed) == "a=0, a=1, a=2, and 2 more, told above (weights: found nothing)"
+    others = _closing([(["dataset=lmo", f"a={n}"], f"{n}: " + "word " * 500) for n in range(9)])
+    assert len(others) < 1000
+    assert others.endswith("; and 6 more, told above")
+
+
+@pytest.mark.parametrize(
+    ("drawn", "told"),
+    [((60, 80, 1, 1), "the mask has 1 pixel;"), ((0, 0, 120, 160), "the mask covers 100% of the image;")],
+)
+def test_an_odd_mask_is_told_and_kept_in_the_record(capsys, monkeypatch, tmp_path, scene, drawn, told):
+    monkeypatch.chdir(tmp_path)
+    row, column, h, w = drawn
+    mask = np.zeros((120, 160), np.uint8)
+    mask[row : row + h, column : column + w] = 255
+    Image.fromarray(mask).save("mask.png")
+    photo = (f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={scene}/test/000001/rgb/000000.png")
+    given = ("dataset=photo", *photo, "dataset.K=[150,150,80,60]", "dataset.mask=mask.png", *SMALL)
+    ran = run_dzop(capsys, monkeypatch, *given)
+    assert ran.status == 0, ran.err
+    assert f"warning: scene 0, image 0, object 1: {told}" in ran.out
+    record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
+    (warning,) = record["warnings"]
+    assert told in warning
+
+
+def test_an_ordinary_mask_is_no_odd_one(dzop, tmp_path):
+    assert "warning:" not in dzop().out
+    assert json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())["warnings"] == []
+
+
+INTERRUPTED = """
+import pipeline.__main__ as command
+async def read(): pass
+def run():
+    pending = read()
+    raise KeyboardInterrupt
+command._run_jobs = run
+command.main()
+"""
+
+
+def test_ctrl_c_leaves_one_line():
+    ran = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=120, check=False)
+    assert ran.stderr == "interrupted: what was complete is kept, and the next run goes on from there\n"
