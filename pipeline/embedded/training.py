@@ -54,7 +54,7 @@ class Plan:
     shards: int = 150
     autoencoder: int = 500
     denoiser: int = 400
-    descriptors: int = 6000
+    descriptors: int = 5300
     easy: int = 2700
     seed: int = 0
 
