@@ -207,6 +207,12 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     return Trace(match, tuple(hypotheses), clock.times_s)
 
 
+def retrace_pose(stages: Stages, query: Query, bank: TemplateBank, template_id: int, score: float) -> Hypothesis:
+    """What one template led to, refined, as it was in the trace that chose it."""
+    clock = Clock()
+    return _refined(stages, query, bank, _hypothesis(stages, query, bank, template_id, score, clock), clock)
+
+
 def _match(stages: Stages, query: Query, bank: TemplateBank) -> TemplateMatch:
     if isinstance(stages.match, TruthMatcher) and query.truth is not None:
         return stages.match.by_truth(query.truth.T_cam_obj, query.truth.symmetries, bank.T_cam_obj)

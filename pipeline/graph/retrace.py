@@ -1,4 +1,4 @@
-"""answer -> how it came about: the online route once more, from stored features, for pictures."""
+"""answer -> how it came about: the route of its template once more, from stored features."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.errors import NoPose
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
-from pipeline.route import Hypothesis, trace_pose
+from pipeline.route import Hypothesis, retrace_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +44,10 @@ class Retracer:
         if found is None:
             return None
         query_rgb = run.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
-        try:
-            best = trace_pose(run.stages, self.poses.query(found)[0], self.templates.bank(answer.obj_id)).best
-        except NoPose:
+        if answer.template_id is None:
             return Retraced(detection, query_rgb)
+        score = answer.template_score if isinstance(answer, PoseEstimate) else 0.0
+        bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
+        hypothesis = retrace_pose(run.stages, query, bank, answer.template_id, score)
         crops = run.store.read(self.templates.crops(answer.obj_id))
-        return Retraced(detection, query_rgb, crops.array("rgb", [best.template_id])[0], best)
+        return Retraced(detection, query_rgb, crops.array("rgb", [answer.template_id])[0], hypothesis)

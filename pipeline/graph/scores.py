@@ -48,7 +48,7 @@ class Judged:
 class ScoreNodes:
     """The entry of a run's scores. ``scorer`` says what poses are held against; ``retrace`` shows correspondences.
 
-    Without ``retrace`` they are not looked at: it takes as long as finding the poses did.
+    Without ``retrace`` they are not looked at.
     """
 
     run: Context
