@@ -1,0 +1,74 @@
+"""What hostile input is held to: our own error in one line, in little time and memory."""
+
+import multiprocessing
+import os
+import resource
+import time
+import traceback
+from collections.abc import Callable
+from datetime import timedelta
+
+from hypothesis import HealthCheck, settings
+
+from pipeline.errors import DzopError
+
+EXAMPLES = int(os.environ.get("DZOP_FUZZ", "0"))
+"""Examples of every fuzz test, fresh ones in every run; 0: few, always the same."""
+
+
+def fuzzed(few: int):
+    """Settings of a fuzz test. No example may take 10 s; the suite's noise is far below."""
+    return settings(
+        max_examples=EXAMPLES or few,
+        derandomize=not EXAMPLES,
+        deadline=timedelta(seconds=10),
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+def outcome(call: Callable[[], object]) -> str:
+    """"read", or the one line of our own error; whatever else is raised fails the test."""
+    try:
+        call()
+    except DzopError as error:
+        assert str(error).strip()
+        assert "\n" not in str(error), str(error)
+        assert len(str(error)) < 2000
+        return str(error)
+    return "read"
+
+
+def _within(call: Callable[[], object], bytes_more: int, answer) -> None:
+    try:
+        used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + bytes_more, used + bytes_more))
+        start = time.monotonic()
+        told = outcome(call)
+        answer.put((told, time.monotonic() - start))
+    except BaseException:
+        answer.put((traceback.format_exc(), 0.0))
+
+
+def within(call: Callable[[], object], *, seconds: float, megabytes: int) -> str:
+    """The outcome in a process that may not take more than this."""
+    context = multiprocessing.get_context("fork")
+    answer = context.Queue()
+    process = context.Process(target=_within, args=(call, megabytes << 20, answer))
+    process.start()
+    try:
+        told, taken = answer.get(timeout=60)
+    finally:
+        process.kill()
+        process.join()
+    assert "Traceback" not in told, told
+    assert "MemoryError" not in told, f"refused only when the memory was spent: {told}"
+    assert taken < seconds, f"{taken:.1f} s: {told}"
+    return told
+
+
+def refused_within(call: Callable[[], object], *, seconds: float, megabytes: int) -> str:
+    """The message of our own error, raised in a process that may not take more than this."""
+    told = within(call, seconds=seconds, megabytes=megabytes)
+    assert told != "read"
+    return told
