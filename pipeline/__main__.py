@@ -104,6 +104,8 @@ def _hydra_main(config: DictConfig) -> None:
         _job(config, sweeping=sweeping)
     except MissingMandatoryValue as error:
         _give_up(config, BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
+    except OmegaConfBaseException as error:
+        _give_up(config, DzopError(_told(error).removeprefix("error: ")))
     except DzopError as error:
         _give_up(config, error)
     except BrokenPipeError:
@@ -125,7 +127,11 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
     write_whole(Path(os.environ[FAILED]) / f"{number:06d}", f"{' '.join(overrides)} ({message})")
-    values = cast(dict[str, Any], _writable(OmegaConf.to_container(config, resolve=True)))
+    try:
+        plain = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException:  # a value that stands for another which is not there
+        plain = OmegaConf.to_container(config, resolve=False)
+    values = cast(dict[str, Any], _writable(plain))
     note_failure(values["out"], values, overrides, message)
 
 
