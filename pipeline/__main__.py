@@ -210,7 +210,7 @@ def variant(values: Mapping[str, Any], where: str) -> Any:
 
 
 def _own_yamls() -> bool:
-    """Whether the user gave a folder of yamls of his own, and set no class beside them: only then others are imported."""
+    """Whether the user gave a folder of yamls and set no class beside them: only then others are imported."""
     if not HydraConfig.initialized():
         return False
     told = HydraConfig.get()

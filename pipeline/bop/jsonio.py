@@ -18,7 +18,7 @@ from pipeline.errors import BadInput
 from pipeline.whole import read_file
 
 _PACKED_TIMES, _PACKED_BYTES = 100, 1 << 26
-"""JSON unpacks to ten times its size or so; what unpacks to more than 100 times it and 64 MiB is made to fill memory."""
+"""JSON unpacks to ten times its size or so; what unpacks to more than 100 times it and 64 MiB is to fill memory."""
 
 
 def read_json(path: Path) -> Any:

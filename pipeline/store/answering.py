@@ -50,9 +50,7 @@ class Answering(WrapperStore[ZarrStore]):
             async for item in asked:
                 yield item
 
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """As ZarrStore.get."""
         return await self._answer(self._store.get(key, prototype, byte_range))
 

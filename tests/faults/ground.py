@@ -46,7 +46,13 @@ class Ground:
 
     def start(self, folder: Path, step: str, *more: str, name: str = "run") -> BaseProcess:
         """``dzop step=...`` with its store and results below ``folder``; prints to ``folder/name.out`` and ``.err``."""
-        arguments = [*SMALL, f"dataset.root={self.scene}", f"detect.proposals.weights={self.sam}", f"step={step}", *more]
+        arguments = [
+            *SMALL,
+            f"dataset.root={self.scene}",
+            f"detect.proposals.weights={self.sam}",
+            f"step={step}",
+            *more,
+        ]
         context = multiprocessing.get_context("forkserver")  # imports are done once; a process is there in no time
         context.set_forkserver_preload(LOADED)
         process = context.Process(target=_command, args=(str(folder), arguments, name))
@@ -138,11 +144,16 @@ def without_seconds(value: Any) -> Any:
     return [without_seconds(item) for item in value] if isinstance(value, list) else value
 
 
-def written(folder: Path) -> dict[str, Any]:
-    """The files of the results, times left out; each must be whole."""
+def written(folder: Path, out: str = "results", *, step: str = "estimate") -> dict[str, Any]:
+    """The files of the results, times left out; each must be whole.
+
+    ``step`` "evaluate": those of one run of it, without what the steps before it leave when they are run alone.
+    """
     found: dict[str, Any] = {}
-    for path in sorted((folder / "results").rglob("*")):
-        name = path.relative_to(folder).as_posix()
+    for path in sorted((folder / out).rglob("*")):
+        name = path.relative_to(folder / out).as_posix()
+        if step == "evaluate" and "overlays-unchecked" in name:
+            continue
         if path.suffix == ".csv":
             found[name] = [row[:-1] for row in csv.reader(path.read_text().splitlines())]
         elif path.suffix == ".json":

@@ -2,7 +2,6 @@
 
 import random
 import shutil
-import time
 from pathlib import Path
 
 import pytest
@@ -12,13 +11,17 @@ from ground import STEPS, Ground, Undisturbed, stored, written
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("kills", [1, pytest.param(50, marks=pytest.mark.faults)])
-def test_a_killed_step_is_healed_by_the_next_run(ground: Ground, quiet: Undisturbed, folder: Path, step, kills, record_property):
+def test_a_killed_step_is_healed_by_the_next_run(
+    ground: Ground, quiet: Undisturbed, folder: Path, step, kills, record_property
+):
     rng = random.Random(f"{step} {kills}")
     whole, results = stored(quiet.after[step]), written(quiet.after[step])
     killed = healed = late = 0
     while killed < kills:
         quiet.copy(folder, quiet.before(step))
-        for _ in range(min(kills - killed, rng.choice([1, 1, 1, 2, 3]))):  # some are killed again before they are healed
+        for _ in range(
+            min(kills - killed, rng.choice([1, 1, 1, 2, 3]))
+        ):  # some are killed again before they are healed
             process = ground.start(folder, step)
             process.join(rng.uniform(0, 0.9 * quiet.seconds[step]))
             late += process.exitcode is not None
@@ -34,4 +37,6 @@ def test_a_killed_step_is_healed_by_the_next_run(ground: Ground, quiet: Undistur
         assert not list((folder / "cache").rglob("*.partial"))
         healed += 1
         shutil.rmtree(folder)
-    record_property("told", f"{step}: {killed} kills (and {late} that came too late), {healed} runs after them, all as undisturbed")
+    record_property(
+        "told", f"{step}: {killed} kills (and {late} that came too late), {healed} runs after them, all as undisturbed"
+    )

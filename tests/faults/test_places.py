@@ -46,8 +46,10 @@ def disk(tmp_path: Path):
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("shares", [(0.4,), pytest.param([n / 25 for n in range(1, 25)], marks=pytest.mark.faults)])
-def test_a_full_disk_is_told_and_with_more_room_the_run_goes_on(ground: Ground, quiet: Undisturbed, disk: Disk, shares, record_property):
-    whole, results = stored(quiet.after["evaluate"]), written(quiet.after["evaluate"])
+def test_a_full_disk_is_told_and_with_more_room_the_run_goes_on(
+    ground: Ground, quiet: Undisturbed, disk: Disk, shares, record_property
+):
+    whole, results = stored(quiet.after["evaluate"]), written(quiet.after["evaluate"], step="evaluate")
     folder = quiet.copy(disk.at / "run", quiet.after["evaluate"])
     needed = disk.used()
     for share in shares:
@@ -65,17 +67,22 @@ def test_a_full_disk_is_told_and_with_more_room_the_run_goes_on(ground: Ground, 
         again = ground.run(folder)
         assert again.status == 0, again.err
         assert stored(folder) == whole
-        assert written(folder) == results
-    record_property("told", f"{len(shares)} disks full at {shares[0]:.0%} to {shares[-1]:.0%} of what a run takes: {len(shares)} healed")
+        assert written(folder, step="evaluate") == results
+    record_property(
+        "told",
+        f"{len(shares)} disks full at {shares[0]:.0%} to {shares[-1]:.0%} of what a run takes: {len(shares)} healed",
+    )
 
 
-def test_a_read_only_store_serves_what_it_has_and_names_what_it_lacks(ground: Ground, quiet: Undisturbed, disk: Disk, folder: Path):
+def test_a_read_only_store_serves_what_it_has_and_names_what_it_lacks(
+    ground: Ground, quiet: Undisturbed, disk: Disk, folder: Path
+):
     folder.mkdir()
     shutil.copytree(quiet.after["evaluate"] / "cache", disk.at / "cache")
     disk.set("ro")
     ended = ground.run(folder, "evaluate", f"store.root={disk.at / 'cache'}")
     assert ended.status == 0, ended.err
-    assert written(folder) == written(quiet.after["evaluate"])
+    assert written(folder, step="evaluate") == written(quiet.after["evaluate"], step="evaluate")
     disk.set("rw")
     shutil.rmtree(disk.at / "cache" / "features")
     (chunk,) = list((disk.at / "cache" / "crops").rglob("rgb/c/1/0/0/0"))[:1]
@@ -118,7 +125,7 @@ def test_a_clock_that_was_wrong_changes_nothing(ground: Ground, quiet: Undisturb
             break
         assert "run again" in ended.err
     assert ended.status == 0, ended.err
-    assert written(folder) == written(quiet.after["evaluate"])
+    assert written(folder, step="evaluate") == written(quiet.after["evaluate"], step="evaluate")
 
 
 def test_entries_completed_in_the_future_are_not_old(quiet: Undisturbed, folder: Path, monkeypatch):

@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Callable
 from datetime import timedelta
+from pathlib import Path
 
 from hypothesis import HealthCheck, settings
 
@@ -28,20 +29,22 @@ def fuzzed(few: int):
 
 
 def outcome(call: Callable[[], object]) -> str:
-    """"read", or the one line of our own error; whatever else is raised fails the test."""
+    """ "read", or the one line of our own error; whatever else is raised fails the test."""
     try:
         call()
     except DzopError as error:
-        assert str(error).strip()
-        assert "\n" not in str(error), str(error)
-        assert len(str(error)) < 2000
-        return str(error)
-    return "read"
+        told = str(error)
+    else:
+        return "read"
+    assert told.strip()
+    assert "\n" not in told, told
+    assert len(told) < 2000
+    return told
 
 
 def _within(call: Callable[[], object], bytes_more: int, answer) -> None:
     try:
-        used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + bytes_more, used + bytes_more))
         start = time.monotonic()
         told = outcome(call)

@@ -30,7 +30,9 @@ SPECIAL = (0, -1, 1 << 31, 1 << 63, 10**30, 0.5, -0.0, 1e308, float("nan"), floa
 SCALARS = st.sampled_from(SPECIAL) | st.integers() | st.floats() | st.text(max_size=5)
 VALUES = st.recursive(
     SCALARS,
-    lambda inner: st.lists(inner, max_size=16) | st.dictionaries(st.text(max_size=3) | st.just("counts"), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=16) | st.dictionaries(st.text(max_size=3) | st.just("counts"), inner, max_size=3)
+    ),
     max_leaves=16,
 )
 
@@ -86,7 +88,9 @@ def mutated(draw, content):
 
 def broken(draw, text: str) -> bytes:
     """The text as bytes, perhaps cut, with bytes changed, in another encoding, or with a mark in front."""
-    data = bytearray(text.encode(draw(st.sampled_from(["utf-8", "utf-8", "utf-8-sig", "utf-16", "latin-1"])), "replace"))
+    data = bytearray(
+        text.encode(draw(st.sampled_from(["utf-8", "utf-8", "utf-8-sig", "utf-16", "latin-1"])), "replace")
+    )
     for _ in range(draw(st.integers(0, 3))):
         if data:
             data[draw(st.integers(0, len(data) - 1))] = draw(st.integers(0, 255))
@@ -100,7 +104,9 @@ def test_a_dataset_is_read_or_refused_in_one_line(root: Path, data):
     whole = path.read_bytes()
     content = mutated(data.draw, json.loads(whole))
     try:
-        path.write_bytes(broken(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode())
+        path.write_bytes(
+            broken(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode()
+        )
         outcome(lambda: everything(root))
     finally:
         path.write_bytes(whole)
@@ -111,7 +117,9 @@ def test_a_dataset_is_read_or_refused_in_one_line(root: Path, data):
 def test_detections_are_read_or_refused_in_one_line(root: Path, detections, tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "detections.json"
     content = mutated(data.draw, json.loads(json.dumps(detections)))
-    path.write_bytes(broken(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode())
+    path.write_bytes(
+        broken(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode()
+    )
     dataset = open_dataset(root, name="tiny")
     outcome(lambda: Json(path=str(path))(dataset, dataset.targets))
 
@@ -121,7 +129,16 @@ def test_detections_are_read_or_refused_in_one_line(root: Path, detections, tmp_
 def test_rows_of_reports_are_read_or_refused_in_one_line(tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / "rows"
     folder.mkdir(exist_ok=True)
-    row = {"format": 1, "id": "a", "status": "done", "at": "", "method": "m", "config": {}, "label": {}, "dataset": None}
+    row = {
+        "format": 1,
+        "id": "a",
+        "status": "done",
+        "at": "",
+        "method": "m",
+        "config": {},
+        "label": {},
+        "dataset": None,
+    }
     row |= {"cases": [], "scores": None, "templates": [], "overrides": [], "failures": [], "counts": {}, "times_s": {}}
     text = json.dumps(mutated(data.draw, row))
     (folder / "a.json").write_bytes(broken(data.draw, text) if data.draw(st.booleans()) else text.encode())

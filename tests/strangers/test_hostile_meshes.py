@@ -82,7 +82,11 @@ def test_a_mesh_is_read_or_refused_in_one_line(folder: Path, whole, data):
 def gltf(count: int, *, sparse: bool = False, **more) -> bytes:
     accessor = {"componentType": 5126, "count": count, "type": "VEC3"}
     if sparse:
-        accessor["sparse"] = {"count": 1, "indices": {"bufferView": 0, "componentType": 5125}, "values": {"bufferView": 0}}
+        accessor["sparse"] = {
+            "count": 1,
+            "indices": {"bufferView": 0, "componentType": 5125},
+            "values": {"bufferView": 0},
+        }
     else:
         accessor["bufferView"] = 0
     tree = {
@@ -136,8 +140,9 @@ def test_what_a_header_claims_costs_neither_time_nor_memory(tmp_path: Path, name
 def test_instances_of_instances_are_not_written_out(tmp_path: Path):
     """Twenty levels of ten children each, all the same node below: a hundred trillion million copies."""
     nodes = [{"children": [level + 1] * 10} for level in range(20)] + [{"mesh": 0}]
-    document = gltf(3, nodes=nodes, buffers=[{"uri": "data:;base64,AAAAAAAAAAAAAAAAAAAgQQAAAAAAAAAAAAAgQQAAIEEAAAAA",
-                                              "byteLength": 36}], bufferViews=[{"buffer": 0, "byteLength": 36}])  # fmt: skip
+    points = "data:;base64,AAAAAAAAAAAAAAAAAAAgQQAAAAAAAAAAAAAgQQAAIEEAAAAA"
+    stored = {"buffers": [{"uri": points, "byteLength": 36}], "bufferViews": [{"buffer": 0, "byteLength": 36}]}
+    document = gltf(3, nodes=nodes, **stored)
     (tmp_path / "copies.gltf").write_bytes(document)
     within(lambda: read_mesh(tmp_path / "copies.gltf"), seconds=5, megabytes=512)
 
@@ -165,14 +170,18 @@ def test_an_image_that_is_a_program_is_not_run(tmp_path: Path, monkeypatch):
     for name in ("skin.png", "skin.eps"):
         (tmp_path / "c.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
         (tmp_path / name).write_bytes(POSTSCRIPT)
-        assert "needs a readable texture" in outcome(lambda: read_mesh(path)) or "EPS" in outcome(lambda: read_mesh(path))
+        assert "needs a readable texture" in outcome(lambda: read_mesh(path)) or "EPS" in outcome(
+            lambda: read_mesh(path)
+        )
     embedded = "data:image/png;base64," + base64.b64encode(POSTSCRIPT).decode()
     box = trimesh.creation.box((1, 2, 3))
     visual = trimesh.visual.TextureVisuals(
         uv=np.zeros((len(box.vertices), 2)),
         material=trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2))),
     )
-    exported = trimesh.exchange.gltf.export_gltf(trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False), embed_buffers=True)
+    exported = trimesh.exchange.gltf.export_gltf(
+        trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False), embed_buffers=True
+    )
     tree = json.loads(exported["model.gltf"])
     tree["images"] = [{"uri": embedded}]
     (tmp_path / "d.gltf").write_text(json.dumps(tree))

@@ -59,7 +59,9 @@ def test_a_class_of_the_package_that_is_no_spec_is_refused(capsys, monkeypatch, 
     assert f"match._target_: found '{name}', needs a class made with @spec" in ran.err
 
 
-def test_ones_own_yaml_may_name_ones_own_class_and_an_override_beside_it_may_not(capsys, monkeypatch, chosen, trap: Path):
+def test_ones_own_yaml_may_name_ones_own_class_and_an_override_beside_it_may_not(
+    capsys, monkeypatch, chosen, trap: Path
+):
     folder = trap.parent / "conf" / "match"
     folder.mkdir(parents=True)
     (folder / "mine.yaml").write_text("_target_: trap.Trap\n")
@@ -92,11 +94,60 @@ def test_a_broken_override_is_told_in_one_line(capsys, monkeypatch, chosen, tmp_
     assert len(ran.err.splitlines()) == 1
 
 
-KEYS = ["match.layer", "match", "extract", "render.count", "dataset.root", "dataset.name", "dataset.split", "out", "step"]
+KEYS = [
+    "match.layer",
+    "match",
+    "extract",
+    "render.count",
+    "dataset.root",
+    "dataset.name",
+    "dataset.split",
+    "out",
+    "step",
+]
 KEYS += ["detect", "select.objects", "threads", "store", "store.root", "evaluate.theta_max", "fuse.layers", "method"]
-KEYS += ["+x", "++match.layer", "~match", "dataset", "runtime.batch", "crop.size", "plan", "sweep", "cluster.count", "fallback"]
-WORDS = ["0", "-1", "1e400", "nan", "null", "[]", "{}", "[[[[", "'", "${match}", "${oc.env:HOME}", "${x", "a: b", "true", ""]
-WORDS += ["hog", "../../etc", "/dev/null", "\u00e9", "[1,2", "{a:1}", "9" * 30, "a=b", "x" * 300, "${oc.decode:'1+1'}", "range(3)"]
+KEYS += [
+    "+x",
+    "++match.layer",
+    "~match",
+    "dataset",
+    "runtime.batch",
+    "crop.size",
+    "plan",
+    "sweep",
+    "cluster.count",
+    "fallback",
+]
+WORDS = [
+    "0",
+    "-1",
+    "1e400",
+    "nan",
+    "null",
+    "[]",
+    "{}",
+    "[[[[",
+    "'",
+    "${match}",
+    "${oc.env:HOME}",
+    "${x",
+    "a: b",
+    "true",
+    "",
+]
+WORDS += [
+    "hog",
+    "../../etc",
+    "/dev/null",
+    "\u00e9",
+    "[1,2",
+    "{a:1}",
+    "9" * 30,
+    "a=b",
+    "x" * 300,
+    "${oc.decode:'1+1'}",
+    "range(3)",
+]
 
 
 @fuzzed(8)

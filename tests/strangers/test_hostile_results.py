@@ -14,7 +14,25 @@ from pipeline.bop.results import COLUMNS, read_results
 from pipeline.scoring import Scorer
 
 POSE = ["1 0 0 0 1 0 0 0 1", "0 0 400"]
-CELLS = ["0", "1", "7", "-1", "1e400", "1e308", "nan", "inf", "0.5", "1_0", "²", "9" * 5000, "", " ", "\0", '"1"', "True"]
+CELLS = [
+    "0",
+    "1",
+    "7",
+    "-1",
+    "1e400",
+    "1e308",
+    "nan",
+    "inf",
+    "0.5",
+    "1_0",
+    "²",
+    "9" * 5000,
+    "",
+    " ",
+    "\0",
+    '"1"',
+    "True",
+]
 CELLS += [*POSE, "1e200 0 0 0 1 0 0 0 1", "1e308 1e308 1e308", "0 0 1e-320"]
 
 
