@@ -206,7 +206,7 @@ def test_a_run_opens_no_port_calls_nobody_and_unpickles_nothing(tmp_path: Path, 
     arguments += [*chosen[1:], "threads=1", f"out={tmp_path / 'results'}"]
     done = subprocess.run(
         [sys.executable, "-c", WATCHED, *arguments],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+        cwd=tmp_path, capture_output=True, text=True, timeout=300,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
