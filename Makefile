@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder comparison report test test-fast lint clean
+.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder comparison report test test-fast test-faults lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -73,7 +73,10 @@ test: $(STAMP) gl ## the whole test suite
 	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-fast: $(STAMP) ## the tests that take less than 20 seconds each
-	$(PY) -m pytest -m "not slow" $(ARGS)
+	$(PY) -m pytest -m "not slow and not faults" $(ARGS)
+
+test-faults: $(STAMP) ## faults injected for real (50 kills of every step, full disk, flipped bytes, ...) and long fuzzing, counts printed
+	DZOP_FUZZ=$${DZOP_FUZZ:-1000} $(PY) -m pytest -m "faults or not faults" tests/faults tests/strangers tests/store $(ARGS)
 
 lint: $(STAMP) ## style, types, import contracts
 	$(PY) -m ruff check .

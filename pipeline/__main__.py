@@ -29,6 +29,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from pydantic.dataclasses import is_pydantic_dataclass
 
 from pipeline.cache_cli import cache_command
 from pipeline.checkpoints import NotFetched, offline
@@ -70,11 +71,26 @@ def main() -> None:
     except BrokenExecutor:
         sys.exit(f"error: {KILLED}")
     except OSError as error:
-        if error.filename is None:
+        if error.errno is None:
             raise
-        sys.exit(f"error: {error.filename}: {error.strerror}")
+        where = "" if error.filename is None else f"{error.filename}: "
+        sys.exit(f"error: {where}{error.strerror}; what was complete is kept, and the next run goes on from there")
+    except MemoryError:
+        sys.exit("error: the memory is spent; what was complete is kept, and the next run goes on from there")
+    except Exception as error:
+        if not _hydras_own(error):
+            raise
+        sys.exit(_told(error))  # some overrides it answers with a ValueError
     except KeyboardInterrupt:
         sys.exit("interrupted: what was complete is kept, and the next run goes on from there")
+
+
+def _hydras_own(error: BaseException) -> bool:
+    """Whether an error was raised while Hydra read the command line, not by a run."""
+    frames = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    return not any(Path(name).is_relative_to(PACKAGE) and not name.endswith("__main__.py") for name in frames) and any(
+        part in Path(frames[-1]).parts for part in ("hydra", "omegaconf", "antlr4", "yaml")
+    )
 
 
 def _run_jobs() -> None:
@@ -115,6 +131,8 @@ def _hydra_main(config: DictConfig) -> None:
         _job(config, sweeping=sweeping)
     except MissingMandatoryValue as error:
         _give_up(config, BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
+    except OmegaConfBaseException as error:
+        _give_up(config, DzopError(_told(error).removeprefix("error: ")))
     except DzopError as error:
         _give_up(config, error)
     except BrokenPipeError:
@@ -136,7 +154,11 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
     write_whole(Path(os.environ[FAILED]) / f"{number:06d}", json.dumps([overrides, message]))
-    values = cast(dict[str, Any], _writable(OmegaConf.to_container(config, resolve=True)))
+    try:
+        plain = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException:  # a value that stands for another which is not there
+        plain = OmegaConf.to_container(config, resolve=False)
+    values = cast(dict[str, Any], _writable(plain))
     note_failure(values["out"], values, overrides, message)
 
 
@@ -211,14 +233,28 @@ def variant(values: Mapping[str, Any], where: str) -> Any:
     target = fields.pop("_target_", None)
     if not isinstance(target, str):
         raise BadInput(f"{where}._target_", found=repr(target), needed="the import path of a class")
+    if target.split(".")[0] != "pipeline" and not _own_yamls():
+        needed = "a class of pipeline; others are named in a yaml below the folder of --config-dir"
+        raise BadInput(f"{where}._target_", found=repr(target), needed=needed)
     try:
         cls = hydra.utils.get_class(target)
     except (ImportError, ValueError, AttributeError) as error:
         raise BadInput(
             f"{where}._target_", found=f"{target!r} ({error})", needed="the import path of a class"
         ) from None
+    if not is_pydantic_dataclass(cls):
+        raise BadInput(f"{where}._target_", found=repr(target), needed="a class made with @spec")
     chosen: Any = build(cls, fields, where=where)
     return chosen.resolve() if hasattr(chosen, "resolve") else chosen
+
+
+def _own_yamls() -> bool:
+    """Whether the user gave a folder of yamls and set no class beside them: only then others are imported."""
+    if not HydraConfig.initialized():
+        return False
+    told = HydraConfig.get()
+    given = any(source.provider == "command-line" for source in told.runtime.config_sources)
+    return given and not any("_target_" in override for override in told.overrides.task)
 
 
 def _nested(value: Any, where: str) -> Any:

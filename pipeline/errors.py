@@ -11,8 +11,15 @@ class BadInput(DzopError):
     """A file, a field or an option that cannot be used."""
 
     def __init__(self, where: object, *, found: object, needed: str) -> None:
-        self.where, self.found, self.needed = str(where), str(found), needed
-        super().__init__(f"{where}: found {found}, needs {needed}")
+        self.where, self.found, self.needed = _line(where), _line(found), needed
+        super().__init__(f"{self.where}: found {self.found}, needs {needed}")
+
+
+def _line(value: object, length: int = 400) -> str:
+    """A value as part of one line, whatever a file made of it."""
+    text = str(value)[: length + 1]
+    text = " ".join(text.splitlines()).replace("\0", "\\0")
+    return text if len(text) <= length else f"{text[:length]}..."
 
 
 class NoPose(Exception):

@@ -1,12 +1,13 @@
 """Mesh files -> meshes in millimetres: the only door to trimesh's loaders.
 
 Numbers are taken as they stand, as millimetres, whatever unit a format prescribes. Files beside a mesh (materials,
-textures) must lie in its folder or below; nothing else is opened, fetched or unpickled.
+textures) must lie in its folder or below, links resolved; nothing else is opened, fetched or unpickled.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import logging
 import re
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,7 @@ from PIL import Image
 from pipeline.digests import files_digest
 from pipeline.errors import BadInput
 from pipeline.items.objects import Mesh
+from pipeline.whole import IMAGE_FORMATS, read_file
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga", ".webp", ".gif", ".ppm")
 _MAX_TEXTURE_PX = 16384
+_MAX_NAME = 255
+_MAX_FACES = 20_000_000
+_MAX_UNSTORED = 1_000_000  # elements of a glTF accessor that no buffer holds: they cost the file nothing
 _GUTTER = 8  # texels around a texture in an atlas: enough for a minification by 8
 
 
@@ -100,7 +105,7 @@ class _Companions:
         try:
             relative = self._inside(name)
             path = self.mesh_path.parent / relative
-            data = _read(path, f"the file named in {self.mesh_path.name}")
+            data = read_file(path, f"the file named in {self.mesh_path.name}")
             if path.suffix.lower() in _PICTURES:
                 _picture(path, data)
         except BadInput as error:
@@ -113,25 +118,23 @@ class _Companions:
 
     def _inside(self, name: str) -> PurePosixPath:
         relative = PurePosixPath(name.strip().strip('"').replace("\\", "/"))
+        if "\0" in name or len(name) > _MAX_NAME:
+            raise BadInput(self.mesh_path, found=f"a reference to {name[:40]!r}...", needed="the name of a file")
         if not (self.mesh_path.parent / relative).is_file():
             relative = PurePosixPath(unquote(str(relative)))  # glTF writes a blank as %20
         outside = relative.is_absolute() or ".." in relative.parts or ":" in str(relative) or str(relative) == "."
-        if outside:
+        if outside or self._linked_out(relative):
             raise BadInput(self.mesh_path, found=f"a reference to {name!r}", needed="a file in the mesh's own folder")
         return relative
 
-
-def _read(path: Path, needed: str) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
-        raise BadInput(path, found=found, needed=needed) from None
+    def _linked_out(self, relative: PurePosixPath) -> bool:
+        folder = self.mesh_path.parent
+        return not (folder / relative).resolve().is_relative_to(folder.resolve())
 
 
 def _picture(path: Path, data: bytes) -> UInt8[np.ndarray, "H W 3"]:
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
             return np.asarray(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         found = "not an image" if isinstance(error, Image.UnidentifiedImageError) else error
@@ -139,7 +142,7 @@ def _picture(path: Path, data: bytes) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _load(path: Path, companions: _Companions) -> Mesh:
-    data = _read(path, "a readable mesh file")
+    data = read_file(path, "a readable mesh file")
     try:
         with _quiet_trimesh():
             if path.suffix.lower() == ".ply":
@@ -237,6 +240,8 @@ def _from_scene(path: Path, data: bytes, companions: _Companions) -> Mesh:
     """Every geometry of an obj, gltf, stl or off file where its scene places it."""
     import trimesh
 
+    if path.suffix.lower() in (".gltf", ".glb"):
+        _check_accessors(path, data)
     resolver: Any = companions  # get() is all that trimesh asks of one
     scene = trimesh.load_scene(
         io.BytesIO(data),
@@ -245,6 +250,9 @@ def _from_scene(path: Path, data: bytes, companions: _Companions) -> Mesh:
         process=False,  # and not maintain_order, which gives a vertex on a seam one of its coordinates at random
     )
     parts = []
+    faces = sum(len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) for node in scene.graph.nodes_geometry)
+    if faces > _MAX_FACES:
+        raise BadInput(path, found=f"{faces} faces, copies counted", needed=f"at most {_MAX_FACES}")
     for node in scene.graph.nodes_geometry:
         T_scene_part, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -254,6 +262,15 @@ def _from_scene(path: Path, data: bytes, companions: _Companions) -> Mesh:
     if not parts:
         raise BadInput(path, found="0 faces", needed="a mesh with vertices and faces")
     return parts[0] if len(parts) == 1 else _joined(path, parts)
+
+
+def _check_accessors(path: Path, data: bytes) -> None:
+    """Raise BadInput where a glTF asks for memory that its buffers do not fill."""
+    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
+    for accessor in json.loads(text).get("accessors", []):
+        if "bufferView" not in accessor and accessor["count"] > _MAX_UNSTORED:
+            found = f"an accessor of {accessor['count']} elements without a buffer"
+            raise BadInput(path, found=found, needed=f"at most {_MAX_UNSTORED}")
 
 
 def _part(path: Path, geometry: Trimesh) -> Mesh:
@@ -270,6 +287,8 @@ def _part(path: Path, geometry: Trimesh) -> Mesh:
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None:
+        if image.format not in (None, "MPO", *IMAGE_FORMATS):  # None: made by trimesh; MPO: a kind of JPEG
+            raise BadInput(path, found=f"a texture in {image.format}", needed=f"one of {', '.join(IMAGE_FORMATS)}")
         texture = np.asarray(image.convert("RGB"))
         factor = getattr(material, "baseColorFactor", None)
         if factor is not None:

@@ -14,6 +14,16 @@ torch.set_num_threads(int(os.environ.get("DZOP_TEST_THREADS", "2")))
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What tests counted: ``record_property("told", ...)``."""
+    reports = terminalreporter.getreports("passed")
+    told = [value for report in reports for name, value in report.user_properties if name == "told"]
+    if told:
+        terminalreporter.section("counted")
+        for line in dict.fromkeys(told):
+            terminalreporter.write_line(line)
+
+
 def _shared(*parts: str) -> Path:
     path = SHARED.joinpath(*parts)
     if not path.exists():

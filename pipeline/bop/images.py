@@ -9,6 +9,7 @@ import PIL.Image
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.errors import BadInput
+from pipeline.whole import IMAGE_FORMATS
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -41,20 +42,29 @@ def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
     return (values * depth_scale).astype(np.float32)
 
 
+_BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """(h, w) from the file's header; the pixels are not read."""
     try:
-        with PIL.Image.open(path) as image:
+        with _header(path) as image:
             return image.height, image.width
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+    except _BROKEN as error:
         raise _unreadable(path, error) from None
+
+
+def _header(path: Path) -> PIL.Image.Image:
+    if path.exists() and not path.is_file():
+        raise OSError("no regular file")
+    return PIL.Image.open(path, formats=IMAGE_FORMATS)
 
 
 def _open(path: Path) -> PIL.Image.Image:
     try:
-        image = PIL.Image.open(path)
+        image = _header(path)
         image.load()  # PIL notices a truncated file only when it reads the pixels
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+    except _BROKEN as error:
         raise _unreadable(path, error) from None
     return image
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
+import re
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +15,53 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import BadInput
+from pipeline.whole import read_file
+
+_PACKED_TIMES, _PACKED_BYTES = 100, 1 << 26
+"""JSON unpacks to ten times its size or so; what unpacks to more than 100 times it and 64 MiB is to fill memory."""
 
 
 def read_json(path: Path) -> Any:
-    """Contents of a ``.json`` or ``.json.gz`` file. Raises BadInput, with the line for a syntax error."""
+    """Contents of a ``.json`` or ``.json.gz`` file, UTF-8 with or without a byte order mark.
+
+    Raises BadInput, with the line for a syntax error; also for a name that an object has twice, since one of its
+    two values would be lost.
+    """
     try:
-        data = path.read_bytes()
-        text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8")
-    except FileNotFoundError:
-        raise BadInput(path, found="no such file", needed="a JSON file") from None
+        data = read_file(path, "a JSON file")
+        text = (_unpacked(path, data) if path.suffix == ".gz" else data).decode("utf-8-sig")
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise BadInput(path, found=f"{type(error).__name__}: {error}", needed="a readable JSON file") from None
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:
         found = f"invalid JSON at line {error.lineno}, column {error.colno} ({error.msg})"
         raise BadInput(path, found=found, needed="valid JSON") from None
     except RecursionError:
         raise BadInput(path, found="JSON nested too deeply", needed="valid JSON") from None
+    except ValueError as error:  # a name twice, or an integer of more digits than Python reads
+        raise BadInput(path, found=str(error).split(";")[0], needed="valid JSON") from None
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    most = max(_PACKED_BYTES, _PACKED_TIMES * len(data))
+    with gzip.open(io.BytesIO(data)) as stream:
+        text = stream.read(most + 1)
+    if len(text) > most:
+        found = f"{len(data)} bytes that unpack to more than {most}"
+        raise BadInput(path, found=found, needed="packed JSON; unpack it first if it is")
+    return text
+
+
+def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the name {next(n for n in names if names.count(n) > 1)[:40]!r} twice in one object")
+    return content
+
+
+_ID = re.compile(r"-?[0-9]{1,18}")
 
 
 def by_id(path: Path) -> dict[int, Any]:
@@ -37,11 +69,13 @@ def by_id(path: Path) -> dict[int, Any]:
     content = read_json(path)
     if not isinstance(content, dict):
         raise BadInput(path, found=f"a JSON {_kind(content)}", needed="a JSON object keyed by id")
-    try:
-        return {int(key): value for key, value in content.items()}
-    except ValueError:
-        strange = next(key for key in content if not key.lstrip("-").isdigit())
-        raise BadInput(path, found=f"the key {strange!r}", needed="integer ids as keys") from None
+    strange = next((key for key in content if not _ID.fullmatch(key)), None)
+    if strange is not None:
+        raise BadInput(path, found=f"the key {strange[:40]!r}", needed="integer ids as keys")
+    found = {int(key): value for key, value in content.items()}
+    if len(found) < len(content):
+        raise BadInput(path, found="an id written in two ways", needed="every id once")
+    return found
 
 
 def place(path: Path, *, field: str = "", **ids: int) -> str:
@@ -62,7 +96,7 @@ def get(record: Any, field: str, where: str) -> Any:
 def integer(record: Any, field: str, where: str) -> int:
     """An integer field."""
     value = get(record, field, where)
-    if isinstance(value, bool) or not isinstance(value, int):
+    if type(value) is not int or abs(value) >= 1 << 63:
         raise BadInput(f"{where}, field {field}", found=brief(value), needed="an integer")
     return value
 
@@ -90,7 +124,10 @@ def is_number(value: Any) -> bool:
 
 def brief(value: Any, *, length: int = 60) -> str:
     """A value as text of one short line; long lists say how many elements they have."""
-    text = json.dumps(value)
+    try:
+        text = json.dumps(value)
+    except (RecursionError, ValueError):
+        return f"a JSON {_kind(value)} too large to show"
     if len(text) <= length:
         return text
     return f"{text[:length]}... ({len(value)} elements)" if isinstance(value, (list, dict)) else f"{text[:length]}..."

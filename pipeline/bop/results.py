@@ -144,7 +144,7 @@ def _id(cell: str, where: str) -> int:
     except ValueError:
         value = -1
     if value < 0:
-        raise BadInput(where, found=repr(cell), needed="an integer >= 0")
+        raise BadInput(where, found=repr(cell[:60]), needed="an integer >= 0")
     return value
 
 

@@ -34,16 +34,18 @@ def _row(store: Store, path: str) -> Row:
     attributes = store.attributes(path) or {}
     record = completeness(attributes, path.rsplit("/", 1)[-1])
     made_from = attributes.get("made_from")
+    recipe = made_from.get("recipe") if isinstance(made_from, dict) else None
     age = None
     if record is not None:
-        age = (datetime.now(UTC) - datetime.fromisoformat(record["at"])).total_seconds() / 3600
+        seconds = (datetime.now(UTC) - datetime.fromisoformat(record["at"])).total_seconds()
+        age = max(0.0, seconds / 3600)  # a clock that was put back makes nothing old
     return Row(
         path=path,
         state="incomplete" if record is None else "complete",
         rows=0 if record is None else int(record["rows"]),
         stored_bytes=store.stored_bytes(path),
         age_h=age,
-        kind=str((made_from or {}).get("recipe", {}).get("kind", "?")),
+        kind=str(recipe.get("kind", "?")) if isinstance(recipe, dict) else "?",
         made_from=made_from,
     )
 

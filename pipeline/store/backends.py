@@ -17,6 +17,7 @@ from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
 from pipeline.errors import BadInput, DzopError
 from pipeline.spec import Spec, spec
+from pipeline.store.answering import Answering
 
 Announce = Callable[[str], None]
 
@@ -120,4 +121,4 @@ class S3StoreConfig(Spec):
             store = FsspecStore.from_url(self.url, storage_options=options)
         except ImportError:
             raise BadInput("store", found="s3 without s3fs", needed="pip install 'dzop[s3]'") from None
-        return Backend(store, self.url, None, lambda key, say: nullcontext())
+        return Backend(Answering(store, self.url), self.url, None, lambda key, say: nullcontext())

@@ -22,6 +22,7 @@ import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 from zarr.core.sync import sync
 from zarr.errors import BaseZarrError
+from zarr.storage import MemoryStore
 
 from pipeline.errors import DzopError
 from pipeline.spec import canonical
@@ -118,8 +119,13 @@ class Store:
     # --- writing ---------------------------------------------------------------------------------------------------
 
     def put_document(self, ref: Ref, document: Any, *, rows: int, time_s: float = 0.0) -> None:
-        """A whole entry without arrays: one JSON document, written at once."""
+        """A whole entry without arrays: one JSON document, written at once.
+
+        One that another process completed meanwhile is left as it is: somebody may be reading it.
+        """
         with self._exclusive([ref]):
+            if self.complete(ref):
+                return
             group = self._fresh(ref)
             finish(group, ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
 
@@ -168,9 +174,9 @@ class Store:
     def _exclusive(self, refs: Sequence[Ref]):
         """Locks of the entries, taken in one order by all; a full disk told in one line."""
         with ExitStack() as stack:
-            for ref in sorted(refs, key=lambda ref: ref.path):
-                stack.enter_context(self.backend.lock(ref.key, partial(self._announce_for, ref)))
             try:
+                for ref in sorted(refs, key=lambda ref: ref.path):
+                    stack.enter_context(self.backend.lock(ref.key, partial(self._announce_for, ref)))
                 yield
             except OSError as error:
                 if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -186,13 +192,16 @@ class Store:
         """An empty group that says what it will be made from."""
         if self._group(ref.path) is not None or self.keys_below(ref.path):
             sync(self.backend.zarr.delete_dir(ref.path))
-        attributes = {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
-        return zarr.open_group(self.backend.zarr, path=ref.path, mode="w", attributes=attributes)
+        return zarr.open_group(self.backend.zarr, path=ref.path, mode="w", attributes=_header(ref))
 
     def _arrays(self, ref: Ref, layouts: Mapping[str, Layout], rows: int) -> dict[str, zarr.Array]:
-        """The entry's arrays: those of an interrupted run when they are of this layout, otherwise new ones."""
+        """The entry's arrays: those of an interrupted run when they are of this layout, otherwise new ones.
+
+        A changed byte in what describes them must start them anew too: filled again as they stand, they would never
+        count as complete.
+        """
         group = self._group(ref.path)
-        if group is not None and group.attrs.get("key") == ref.key:
+        if group is not None and _same_header(group, ref):
             for key in self.keys_below(ref.path):
                 if key.endswith(".partial"):  # half a chunk of a killed run; the lock is ours, nobody writes it
                     sync(self.backend.zarr.delete(key))
@@ -351,9 +360,23 @@ def _create(group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Arr
     )
 
 
+def _header(ref: Ref) -> dict[str, Any]:
+    return {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
+
+
+def _same_header(group: zarr.Group, ref: Ref) -> bool:
+    header = _header(ref)
+    try:
+        return canonical({name: group.attrs.get(name) for name in header}) == canonical(header)
+    except ValueError:  # a changed byte made a number that is none
+        return False
+
+
 def _fits(array: zarr.Array | None, layout: Layout, rows: int) -> bool:
-    shape = (rows, *layout.row)
-    return array is not None and array.shape == shape and array.dtype == np.dtype(layout.dtype)
+    if array is None or array.shape != (rows, *layout.row):
+        return False
+    ours = _create(zarr.open_group(MemoryStore(), mode="w"), "array", layout, rows)
+    return metadata_digest(array) == metadata_digest(ours)
 
 
 def _readable(array: zarr.Array, row: int) -> bool:

@@ -45,7 +45,7 @@ def chunks(cache: Path) -> int:
     return sum("c" in path.parts[-6:] for path in cache.rglob("*") if path.is_file())
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_ten_kills_at_random_moments_change_no_byte(tmp_path):
     scene, quiet, disturbed = tmp_path / "scene", tmp_path / "quiet", tmp_path / "disturbed"
     write_dataset(scene, objects=1, images=1, seed=2, size_hw=(120, 160), per_image=1, progress=False)
