@@ -11,17 +11,31 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
+from benchmarks.extraction import extraction, extraction_sd
+from benchmarks.jobs import memory, onboarding, warm
 from benchmarks.measure import Figure, machine, table
 from benchmarks.online import online
+from benchmarks.rendering import rendering
+from benchmarks.storing import storing
 from pipeline.whole import write_json
 
-PARTS: dict[str, Callable[..., list[Figure]]] = {"online": online}
+PARTS: dict[str, Callable[..., list[Figure]]] = {
+    "online": online,
+    "store": storing,
+    "render": rendering,
+    "extract": extraction,
+    "jobs": warm,
+    "onboard": onboarding,
+    "memory": memory,
+    "extract-sd": extraction_sd,
+}
+ASKED = ("extract-sd",)  # for by name alone
 
 
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all of them where none is named")
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all but {ASKED[0]} where none is named")
     parser.add_argument("--json", type=Path, default=Path("results/bench.json"), help="where the figures go")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:N")
     parser.add_argument("--repeats", type=int, default=7, help="turns of which medians are taken")
@@ -35,7 +49,7 @@ def main() -> None:
     facts = machine(args.device)
     print(json.dumps(facts), flush=True)
     figures: list[Figure] = []
-    for name in args.parts or PARTS:
+    for name in args.parts or [part for part in PARTS if part not in ASKED]:
         found = PARTS[name](device=args.device, repeats=args.repeats)
         print(f"\n{name}\n{table(found)}", flush=True)
         figures += found
