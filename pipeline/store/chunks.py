@@ -44,7 +44,7 @@ def _read_chunk(path: str, into: np.ndarray) -> None:
     stored, beyond = bytearray(_CRC), bytearray(1)
     file = os.open(path, os.O_RDONLY)
     try:
-        size = os.preadv(file, [memoryview(into), stored, beyond], 0)
+        size = os.preadv(file, [into.data, stored, beyond], 0)
     finally:
         os.close(file)
     if size != len(into) + _CRC:
