@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder comparison report test test-fast test-faults lint clean
+.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder comparison report bench test test-fast test-faults lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -68,6 +68,9 @@ comparison: $(STAMP) ## dzop, zs6d, foundpose and fused features on the same det
 
 report: $(STAMP) ## one page of all runs below results/: results/report/index.html
 	$(PY) -m pipeline step=report $(ARGS)
+
+bench: $(STAMP) ## times against named references and the targets they have to meet; ARGS="online --device cuda" for a part
+	$(PY) -m benchmarks $(ARGS)
 
 test: $(STAMP) gl ## the whole test suite
 	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile $(ARGS)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import torch
 from pydantic import Field
+from threadpoolctl import threadpool_limits
 
 from pipeline.bop.dataset import Dataset
 from pipeline.checkpoints import NotFetched
@@ -267,6 +268,7 @@ def _use_threads(threads: int) -> None:
     if threads:
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
+        threadpool_limits(threads)  # BLAS beneath SciPy, which has threads of its own
 
 
 def _headline(options: Options, stages: Stages, data: Dataset, targets: Sequence[Target], store: Store) -> str:

@@ -21,8 +21,7 @@ def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Te
     mean = samples.mean(0)
     centred = samples - mean
     wide = centred.shape[0] < centred.shape[1]
-    gram = centred @ centred.T if wide else centred.T @ centred
-    variance, vectors = _leading(gram.cpu().numpy().astype(np.float64), dim)
+    variance, vectors = _leading(_gram(centred if wide else centred.T, exact=wide).astype(np.float64), dim)
     leading = torch.from_numpy(vectors).to(samples.device, samples.dtype)
     if wide:
         leading = centred.T @ (leading / torch.from_numpy(variance).sqrt().to(leading))
@@ -53,6 +52,17 @@ def projected(
     """Coordinates of samples, less the mean, on the axes, in float32."""
     shift = mean @ axes
     return torch.cat([part.float() @ axes - shift for part in samples.split(block)])
+
+
+def _gram(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
+    """Products of all pairs of rows: numpy knows x x^T for what it is, and computes half of it.
+
+    ``exact``, in float64 on the CPU: for few samples, whose axes are sums of them over the root of their variance.
+    """
+    if x.device.type != "cpu":
+        return (x @ x.T).cpu().numpy()
+    a = (x.double() if exact else x).numpy()
+    return a @ a.T
 
 
 def _leading(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:

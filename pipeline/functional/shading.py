@@ -89,11 +89,12 @@ def texture_colour(
     levels: Sequence[UInt8[np.ndarray, "_ _ 3"]], uv: Float[np.ndarray, "n 2"], texels: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Colours (0..255) at ``uv``, bilinear in the mip level nearest to the samples' width in ``texels``."""
-    level = np.clip(np.rint(np.log2(np.maximum(texels, 1.0))), 0, len(levels) - 1).astype(int)
+    # the exponent of sqrt(2) x, less 1, is the integer nearest to log2 x
+    level = np.clip(np.frexp(np.maximum(texels, 1.0) * 2**0.5)[1] - 1, 0, len(levels) - 1)
     colour = np.empty((len(uv), 3), dtype=np.float32)
-    for k in np.unique(level):
-        rows = level == k
-        colour[rows] = _bilinear(levels[k], uv[rows])
+    for k in np.flatnonzero(np.bincount(level)).tolist():
+        rows = np.flatnonzero(level == k)
+        colour[rows] = _bilinear(levels[k], uv.take(rows, axis=0))
     return colour
 
 
@@ -104,8 +105,18 @@ def _bilinear(image: UInt8[np.ndarray, "h w 3"], uv: Float[np.ndarray, "n 2"]) -
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = (x - x0).astype(np.float32)[:, None], (y - y0).astype(np.float32)[:, None]
-    left, top = np.mod(x0, w).astype(np.int64), np.mod(y0, h).astype(np.int64)
-    right, top_row, bottom_row = (left + 1) % w, top * w, (top + 1) % h * w
-    upper = texels[top_row + left] * (1 - fx) + texels[top_row + right] * fx
-    lower = texels[bottom_row + left] * (1 - fx) + texels[bottom_row + right] * fx
+    left, right = _wrapped(x0, w)
+    top_row, bottom_row = (row * w for row in _wrapped(y0, h))
+    upper = texels.take(top_row + left, axis=0) * (1 - fx) + texels.take(top_row + right, axis=0) * fx
+    lower = texels.take(bottom_row + left, axis=0) * (1 - fx) + texels.take(bottom_row + right, axis=0) * fx
     return upper * (1 - fy) + lower * fy
+
+
+def _wrapped(low: Float[np.ndarray, " n"], size: int) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Indices and those after them, beyond the border from the start again."""
+    first = low.astype(np.int64)
+    if len(first) and (first.min() < 0 or first.max() >= size):
+        first %= size
+    after = first + 1
+    after[after == size] = 0
+    return first, after

@@ -17,15 +17,21 @@ def unit(x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
     return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
 
 
-def global_cosine(query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"]) -> Float[Tensor, " n"]:
-    """Cosine of the flattened maps, 0 where a map is all zero. The bank may be float16; sums are float32."""
+def global_cosine(
+    query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"], *, norm: Float[Tensor, " n"] | None = None
+) -> Float[Tensor, " n"]:
+    """Cosine of the flattened maps, 0 where a map is all zero. The bank may be float16; sums are float32.
+
+    ``norm``: the bank's ``map_norms``, which take as long as all the rest, where they are known.
+    """
     q = unit(query.float().flatten())
-    dot, norm = [], []
-    for block in _float_blocks(bank):
-        flat = block.flatten(1)
-        dot.append(flat @ q)
-        norm.append(torch.linalg.vector_norm(flat, dim=1))
-    return _divided(torch.cat(dot), torch.cat(norm))
+    dot = torch.cat([block.flatten(1) @ q for block in _float_blocks(bank)])
+    return _divided(dot, map_norms(bank) if norm is None else norm)
+
+
+def map_norms(bank: Float[Tensor, "n c h w"]) -> Float[Tensor, " n"]:
+    """Lengths of the flattened maps, float32."""
+    return torch.cat([torch.linalg.vector_norm(block.flatten(1), dim=1) for block in _float_blocks(bank)])
 
 
 def cell_cosine(query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w"]:
@@ -97,9 +103,12 @@ def _nearest(a: Float[Tensor, "m c"], b: Float[Tensor, "n c"]) -> tuple[Float[Te
 
 
 def _float_blocks(bank: Tensor) -> Iterator[Tensor]:
+    """Blocks of a bank in float32: each is overwritten by the next, for fresh memory costs more than the sums."""
     values = _CUDA_BLOCK if bank.is_cuda else _CPU_BLOCK
-    for block in bank.split(max(1, values // max(1, bank[0].numel()))):
-        yield block.float()
+    rows = max(1, values // max(1, bank[0].numel()))
+    into = torch.empty((min(rows, len(bank)), *bank.shape[1:]), dtype=torch.float32, device=bank.device)
+    for block in bank.split(rows):
+        yield into[: len(block)].copy_(block)
 
 
 def _divided(numerator: Tensor, denominator: Tensor) -> Tensor:

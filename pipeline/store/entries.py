@@ -27,6 +27,7 @@ from zarr.storage import MemoryStore
 from pipeline.errors import DzopError
 from pipeline.spec import canonical
 from pipeline.store.backends import Backend, StoreConfig
+from pipeline.store.chunks import plain, read_rows
 from pipeline.store.keys import Ref
 from pipeline.store.seal import FORMAT, completeness, finish, metadata_digest
 
@@ -317,8 +318,10 @@ class Entry:
 
         Raises DamagedEntry for a missing chunk, a wrong checksum or other metadata.
         """
-        array = self._whole(name)
+        array, folder = self._whole(name), self.store.backend.folder
         try:
+            if folder is not None and plain(array):
+                return read_rows(folder, array, range(array.shape[0]) if rows is None else list(rows))
             if rows is None:
                 return np.asarray(array[...])
             wanted = list(rows)
@@ -328,6 +331,9 @@ class Entry:
             ):  # neighbours are read at once, as batches ask for them
                 return np.asarray(array[first : first + len(wanted)])
             return np.stack([np.asarray(array[row]) for row in wanted])
+        except FileNotFoundError:
+            self._check_present(name, array)
+            raise self.store._damaged(self.ref, f"array {name} lacked a chunk a moment ago") from None
         except _UNREADABLE as error:
             raise self.store._damaged(self.ref, f"array {name} does not pass its checksum ({error})") from None
 
@@ -337,11 +343,15 @@ class Entry:
         array = Store._array(self.group, name)
         if array is None or metadata_digest(array) != self.record["arrays"].get(name):
             raise self.store._damaged(self.ref, f"array {name} has other metadata than when it was completed")
+        if self.store.backend.folder is None or not plain(array):  # Zarr reads a chunk that is not there as zeros
+            self._check_present(name, array)
+        self._checked[name] = array
+        return array
+
+    def _check_present(self, name: str, array: zarr.Array) -> None:
         missing = array.shape[0] - len(self.store.chunks_present(array))
         if missing:
             raise self.store._damaged(self.ref, f"array {name} lacks {missing} of {array.shape[0]} chunks")
-        self._checked[name] = array
-        return array
 
     @cached_property
     def _checked(self) -> dict[str, zarr.Array]:

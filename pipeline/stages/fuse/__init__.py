@@ -85,9 +85,10 @@ def samples(
         sides = [query.flatten(1), template.flatten(1)]
     else:
         inside = _cell_masks(*masks, cells=query.shape[-1])
-        sides = [side.flatten(1)[:, foreground(mask)] for side, mask in zip((query, template), inside, strict=True)]
+        pairs = zip((query, template), inside, strict=True)
+        sides = [side.flatten(1).index_select(1, foreground(mask)) for side, mask in pairs]
     both = torch.cat(sides, dim=1).T
-    if not bool(torch.isfinite(both).all()):
+    if not bool(torch.isfinite(both.sum(0)).all()):  # one value that is not finite makes its sum so
         raise NoPose("fuse", f"features of layer {layer} are not finite")
     return both
 

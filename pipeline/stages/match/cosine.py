@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping
 from typing import ClassVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
-from pipeline.functional.similarity import global_cosine
+from pipeline.functional.similarity import global_cosine, map_norms
 from pipeline.items.matches import TemplateMatch
 from pipeline.spec import NonNegative, Positive, Spec, spec
 from pipeline.stages.match import ranked
@@ -34,4 +36,16 @@ class Cosine(Spec):
         bank_mask: Bool[Tensor, "n S S"],
     ) -> TemplateMatch:
         """The ``top_k`` best templates. Raises NoPose when the query's features are all zero or not finite."""
-        return ranked(global_cosine(query, bank), top_k=self.top_k)
+        return ranked(global_cosine(query, bank, norm=_norms(bank)), top_k=self.top_k)
+
+
+_NORMS: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
+"""Of the banks in use, by identity, with the count of changes in place: an object's many queries share its norms."""
+
+
+def _norms(bank: Float[Tensor, "n c h w"]) -> Float[Tensor, " n"]:
+    version, norms = _NORMS.get(bank, (-1, None))
+    if norms is None or version != bank._version:
+        norms = map_norms(bank)
+        _NORMS[bank] = bank._version, norms
+    return norms

@@ -57,11 +57,13 @@ class Raycast(Studio):
         colour, samples = self._colour(surface, centre, footprint), np.ones(len(px), dtype=np.float32)
         if self.supersample > 1:
             offsets = subpixels(self.supersample)
-            fine_px = (px[:, None] + offsets).reshape(-1, 2)
-            fine = caster.cast(K, T_cam_obj, fine_px)
-            per_ray = np.zeros((len(fine_px), 3), dtype=np.float32)
+            apart = (_directions(K, T_cam_obj, offsets) - _directions(K, T_cam_obj, np.zeros((1, 2)))).astype(
+                np.float32
+            )
+            fine = caster.cast_along(T_cam_obj, (centre.direction[:, None] + apart).reshape(-1, 3))
+            per_ray = np.zeros((len(px) * len(offsets), 3), dtype=np.float32)
             per_ray[fine.ray] = self._colour(surface, fine, footprint)
-            colour = colour + np.einsum("msc->mc", per_ray.reshape(len(px), len(offsets), 3))
+            colour = colour + per_ray.reshape(len(px), len(offsets), 3).sum(axis=1)
             samples = samples + np.bincount(fine.ray // len(offsets), minlength=len(px))
         rgb[px[:, 1], px[:, 0]] = np.rint(np.clip(colour / samples[:, None], 0, 255))
 
@@ -138,10 +140,13 @@ class _Caster:
         px: Float[np.ndarray, "m 2"] | Int[np.ndarray, "m 2"],
     ) -> Hits:
         """What the rays through pixels ``px`` meet first. Directions have z = 1 in the camera: length is depth."""
+        return self.cast_along(T_cam_obj, _directions(K, T_cam_obj, px).astype(np.float32))
+
+    def cast_along(self, T_cam_obj: Float[np.ndarray, "4 4"], direction: Float32[np.ndarray, "m 3"]) -> Hits:
+        """As ``cast``, of directions in the object's frame."""
         R, t = T_cam_obj[:3, :3], T_cam_obj[:3, 3]
-        direction = _directions(K, T_cam_obj, px).astype(np.float32)
         near_mm = max(float((R @ self.centre + t)[2]) - 1.01 * self.radius, 0.0)
-        start = (near_mm * direction - (R.T @ t + self.centre)).astype(np.float32)
+        start = np.float32(near_mm) * direction - (R.T @ t + self.centre).astype(np.float32)
         found = self.scene.run(start, direction, output=1)
         ray = np.flatnonzero(found["primID"] >= 0)
         u, v = found["u"][ray], found["v"][ray]
@@ -175,16 +180,19 @@ class _Surface:
             skin = mesh.colours[mesh.faces]
         else:
             skin = np.full((len(mesh.faces), 3, 3), PLAIN)
-        self.corners = np.concatenate([normals, skin], axis=-1).astype(np.float32)
+        corners = np.concatenate([normals, skin], axis=-1).astype(np.float32)
+        self.corners = tuple(np.ascontiguousarray(corners[:, k]) for k in range(3))
 
     def at(
         self, hits: Hits, *, footprint_mm: Float[np.ndarray, " m"]
     ) -> tuple[Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
         """Albedo (0..255) and normal (object frame, of any length) where rays hit, each ``footprint_mm`` wide."""
-        value = np.einsum("mk,mkc->mc", hits.weight, self.corners[hits.face])
+        value = np.zeros((len(hits.face), self.corners[0].shape[1]), dtype=np.float32)
+        for corner, weight in zip(self.corners, hits.weight.T, strict=True):
+            value += corner.take(hits.face, axis=0) * weight[:, None]
         if not self.levels:
             return value[:, 3:], value[:, :3]
-        return texture_colour(self.levels, value[:, 3:], self.density[hits.face] * footprint_mm), value[:, :3]
+        return texture_colour(self.levels, value[:, 3:], self.density.take(hits.face) * footprint_mm), value[:, :3]
 
 
 def _directions(

@@ -1,0 +1,1 @@
+"""How fast each part is against a named reference in the same run, and which targets it meets: ``make bench``."""

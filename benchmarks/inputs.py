@@ -1,0 +1,105 @@
+"""Inputs of the size of Stable Diffusion's features, in which a pose can be found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from pipeline.functional import rigid
+from pipeline.items.views import Crops, Geometry
+from pipeline.route import Query, TemplateView
+from pipeline.spec import Runtime
+from pipeline.stages.crop.square import Square
+from pipeline.stages.extract.coordinates import Coordinates
+from pipeline.stages.fit import Fit, Fitted
+from pipeline.stages.render.raycast import Raycast
+from pipeline.synthetic.objects import make_object
+
+SD15 = {2: (1280, 8), 5: (1280, 16), 8: (640, 32), 11: (320, 64)}
+"""layer -> channels and cells a side of SD 1.5's maps (hook=pre) at 512 px."""
+
+TOY = {2: (96, 8), 5: (96, 16), 8: (64, 32), 11: (48, 64)}
+"""The same cells with few channels, for tests."""
+
+TEMPLATES = 300
+_NOISE = 0.5  # of the features' own standard deviation: template and query are no copies of one another
+_OBJECT = 1  # fills half of its crop: more cells than most
+_TURN_DEG = 8.0  # from the best template to the query
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Templates in memory, float16 as stored: ``views`` in full, the others by the match layer alone."""
+
+    features: Float[Tensor, "n c h w"]
+    mask: Bool[Tensor, "n S S"]
+    T_cam_obj: Float[np.ndarray, "n 4 4"]
+    views: tuple[TemplateView, ...]
+
+    def view(self, index: int) -> TemplateView:
+        """Everything about one template."""
+        return self.views[index]
+
+    def fitted(self, fit: Fit) -> Fitted:
+        """Nothing is fitted here."""
+        raise NotImplementedError(fit.kind)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A query, the bank it is matched against, and its true pose."""
+
+    query: Query
+    bank: Bank
+    T_true: Float[np.ndarray, "4 4"]
+
+
+def scene(shapes: Mapping[int, tuple[int, int]], *, device: str = "cpu", views: int = 4, seed: int = 0) -> Scene:
+    """A view of a procedural object, and ``TEMPLATES`` templates of which the first is the nearest.
+
+    Features are Fourier features of the object points that cells see, mixed into the channels of each layer, and noise.
+    """
+    mesh, renderer = make_object(_OBJECT), Raycast(count=TEMPLATES, viewpoints="fibonacci")
+    K, T_cam_obj, size_hw = renderer.cameras(mesh)
+    turn = rigid.rotation_between(np.array([0.0, 0, 1]), np.array([np.sin(np.radians(_TURN_DEG)), 0, 1]))
+    T_true = T_cam_obj[0] @ rigid.rigid(turn, np.zeros(3))
+    poses = np.concatenate([T_true[None], T_cam_obj[:views]])
+    _, depth_mm = renderer.render(mesh, K, poses, size_hw)
+    crop, rgb = Square(), np.zeros((*size_hw, 3), dtype=np.uint8)
+    whole = (-0.5, -0.5, size_hw[1] - 0.5, size_hw[0] - 0.5)
+    cropped = [crop(rgb, depth > 0, whole, K) for depth in depth_mm]
+    rgb_crops, mask_crops, A_crop_img = (np.stack(part) for part in zip(*cropped, strict=True))
+    geometry = Geometry(list(depth_mm), np.repeat(K[None], len(poses), 0), poses)
+    crops = Crops(rgb_crops, mask_crops, A_crop_img, geometry)
+    maps = {layer: m.to(device) for layer, m in _mixed(crops, shapes, seed=seed).items()}
+    masks = torch.from_numpy(crops.mask).to(device)
+    each = [{layer: m[i] for layer, m in maps.items()} for i in range(len(poses))]
+    template = tuple(
+        TemplateView(each[i], masks[i], crops.A_crop_img[i], depth_mm[i], K, poses[i]) for i in range(1, len(poses))
+    )
+    generator = torch.Generator().manual_seed(seed)
+    others = torch.randn((TEMPLATES - views, *maps[2].shape[1:]), generator=generator).half().to(device)
+    bank_mask = torch.cat([masks[1:], masks[1:2].expand(TEMPLATES - views, -1, -1)])
+    bank = Bank(torch.cat([maps[2][1:], others]), bank_mask, T_cam_obj, template)
+    return Scene(Query(each[0], masks[0], crops.A_crop_img[0], K), bank, T_true)
+
+
+def _mixed(crops: Crops, shapes: Mapping[int, tuple[int, int]], *, seed: int) -> dict[int, Tensor]:
+    """float16 maps of every layer's channels and cells, of unit variance on the object."""
+    generator = torch.Generator().manual_seed(seed)
+    found = Coordinates(bandwidth_mm=15.0).load(Runtime(device="cpu"))(crops, tuple(shapes))
+    maps = {}
+    for layer, (channels, cells) in shapes.items():
+        own = avg_pool2d(found[layer], found[layer].shape[-1] // cells)
+        mix = torch.randn((channels, own.shape[1]), generator=generator)
+        signal = torch.einsum("kc,nchw->nkhw", mix, own)
+        seen = (own.abs().sum(1, keepdim=True) > 0).float()
+        noise = torch.randn(signal.shape, generator=generator)
+        maps[layer] = (signal + _NOISE * noise * seen).half()
+    return maps

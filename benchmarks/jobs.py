@@ -1,0 +1,118 @@
+"""Whole runs: what a warm job costs, what an object's onboarding costs, what `estimate` holds in memory."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from benchmarks.measure import Figure, interleaved
+from pipeline.__main__ import CONF, options_of, stages_of, variant
+from pipeline.run import run
+from pipeline.spec import Runtime, build
+from pipeline.store import Store
+
+SMALL = ("dataset=demo", "dataset.objects=6", "dataset.images=8", "dataset.per_image=3", "evaluate.vsd=false")
+QUIET = ("overlays=false", "gallery=0", "runtime.progress=false")
+FEW, MANY = 2, 6
+
+
+def job(folder: Path, *overrides: str) -> None:
+    """One run, as the command line makes it; what it prints is dropped."""
+    places = (f"dataset.root={folder / 'data'}", f"store.root={folder / 'cache'}", f"out={folder / 'out'}")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [*places, *QUIET, f"threads={torch.get_num_threads()}", *overrides])
+    values = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(values, dict)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        run(
+            stages=stages_of(values),  # type: ignore[arg-type]
+            dataset=variant(values["dataset"], "dataset"),
+            store=Store(variant(values["store"], "store")),
+            runtime=build(Runtime, values["runtime"], where="runtime"),
+            options=options_of(values),  # type: ignore[arg-type]
+        )
+
+
+def warm(*, device: str, repeats: int) -> list[Figure]:
+    """Seconds of a job of which everything is cached, beside a bare read of its configuration."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        chosen = (*SMALL, "extract=pixels", "render.count=12", f"runtime.device={device}")
+        job(folder, *chosen)
+        took = interleaved(
+            {"job": lambda: job(folder, *chosen), "estimate": lambda: job(folder, *chosen, "step=estimate")},
+            repeats=repeats,
+        )
+    sized = "6 objects, 8 images, 24 targets"
+    return [
+        Figure(f"warm job, step=all, {sized}", took["job"].cpu_s, "s of one core", "", 0.3),
+        Figure(f"warm job, step=estimate, {sized}", took["estimate"].cpu_s, "s of one core", "", 0.3),
+    ]
+
+
+def onboarding(*, device: str, repeats: int) -> list[Figure]:
+    """Seconds per object: templates, crops and features of the embedded model."""
+    chosen = ("dataset=demo", "dataset.objects=1", "dataset.images=1", "dataset.per_image=1", "step=onboard")
+    views, seconds = 24, []
+    with tempfile.TemporaryDirectory() as name:
+        for turn in range(2):  # the first makes the data and loads the model's files
+            start = time.process_time()
+            job(Path(name), *chosen, f"render.count={views + turn}", f"runtime.device={device}")
+            seconds.append(time.process_time() - start)
+    return [
+        Figure("onboarding, one object, embedded model", 1e3 * seconds[-1] / (views + 1), "ms of one core per view")
+    ]
+
+
+def memory(*, device: str, repeats: int) -> list[Figure]:
+    """Peak of step=estimate with few and with many objects, each in a process of its own.
+
+    ``features cached``: the same with another parameter of correspondences, so that poses alone are computed.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        peaks = {objects: _peak_mb(Path(name) / str(objects), objects, device, 10) for objects in (FEW, MANY)}
+        again = {objects: _peak_mb(Path(name) / str(objects), objects, device, 9) for objects in (FEW, MANY)}
+    figures = []
+    for title, of in (("nothing cached", peaks), ("features cached", again)):
+        grown = (of[MANY] - of[FEW]) / (MANY - FEW)
+        figures += [
+            Figure(f"peak memory of estimate, {MANY} objects, {title}", of[MANY], "MB"),
+            Figure(f"memory each further object adds, {title}", grown, "MB", f"{FEW} objects", 2.0),
+        ]
+    return figures
+
+
+def _peak_mb(folder: Path, objects: int, device: str, per_cluster: int) -> float:
+    command = [sys.executable, "-m", "benchmarks.jobs", str(folder), str(objects), device, str(per_cluster)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return float(json.loads(done.stdout.splitlines()[-1])["peak_mb"])
+
+
+def _estimate(folder: str, objects: str, device: str, per_cluster: str) -> None:
+    """In a process of its own: estimate, and print the most memory that was resident."""
+    torch.set_num_threads(1)
+    size = ("dataset=demo", f"dataset.objects={objects}", f"dataset.images={objects}", "dataset.per_image=1")
+    chosen = ("extract=coordinates", "method=dzop", "render.count=16", "step=estimate", f"runtime.device={device}")
+    if not (Path(folder) / "done").exists():
+        Path(folder).mkdir(parents=True)
+        job(Path(folder), *size, "extract=pixels", "render.count=2", "step=detect")  # makes the data set
+    job(Path(folder), *size, *chosen, f"correspond.per_cluster={per_cluster}")
+    (Path(folder) / "done").touch()
+    print(json.dumps({"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+
+
+if __name__ == "__main__":
+    _estimate(*sys.argv[1:])

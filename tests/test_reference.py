@@ -1,0 +1,100 @@
+"""The package's steps against the paper written plainly with scikit-learn, SciPy, OpenCV: benchmarks/reference.py."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import reference
+from benchmarks.inputs import TOY, scene
+from benchmarks.online import PAPER, Plain
+from pipeline.functional import camera, rigid
+from pipeline.functional.kmeans import kmeans
+from pipeline.functional.masks import cell_mask, foreground
+from pipeline.functional.similarity import global_cosine, unit
+from pipeline.route import trace_pose
+
+
+@pytest.fixture(scope="module")
+def made():
+    return scene(TOY)
+
+
+@pytest.fixture(scope="module")
+def plain(made):
+    return Plain(made)
+
+
+@pytest.fixture(scope="module")
+def pair(made):
+    template = made.bank.view(0)
+    return PAPER.fuse(made.query.features, template.features, made.query.mask, template.mask)
+
+
+@pytest.mark.parametrize("cells", [8, 16, 32, 64])
+def test_cells_inside_a_mask_are_the_references(made, cells):
+    ours = cell_mask(made.query.mask, cells=cells).numpy()
+    np.testing.assert_array_equal(ours, reference.cell_mask(made.query.mask.numpy(), cells))
+
+
+def test_similarities_of_all_templates_are_the_references(made, plain):
+    ours = global_cosine(made.query.features[2], made.bank.features).numpy()
+    # float32 sums of 6,144 products
+    np.testing.assert_allclose(ours, reference.retrieve(plain.query[2], plain.bank), atol=1e-5)
+
+
+def test_fused_maps_have_the_references_inner_products(pair, plain):
+    template, template_mask, *_ = plain.view(0)
+    query_map, template_map = reference.co_project(
+        plain.query, template, plain.query_mask, template_mask, dims=plain.dims
+    )
+    theirs = np.einsum("dhw,dhw->hw", query_map, template_map)
+    # signs of axes are free, products are not; float32 against float64
+    ours = torch.einsum("dhw,dhw->hw", pair.query, pair.template).numpy()
+    np.testing.assert_allclose(ours, theirs, atol=2e-4 * np.abs(theirs).max())
+
+
+def test_k_means_ends_at_the_references_centres(pair):
+    points = unit(pair.query.flatten(1).T[foreground(pair.query_mask)]).contiguous()
+    label, centre = kmeans(points, count=40, seed=3, iterations=30)
+    their_label, their_centre = reference.k_means(points.double().numpy(), count=40, seed=3, iterations=30)
+    # a point in between two centres may go to either in float32, which moves centres by little
+    assert np.mean(label.numpy() == their_label) > 0.99
+    assert np.median(np.abs(centre.numpy() - their_centre)) < 1e-3
+
+
+def test_correspondences_in_given_clusters_are_the_references(pair):
+    clusters = PAPER.cluster(pair)
+    ours = PAPER.correspond(pair, clusters, crop_size=128)
+    query_px, template_px = reference.correspond(
+        pair.query.double().numpy(),
+        pair.template.double().numpy(),
+        pair.template_mask.numpy(),
+        clusters.query_label.numpy(),
+        clusters.template_label.numpy(),
+        clusters.pairs.numpy(),
+        crop_size=128,
+    )
+    there = {tuple(np.rint(px).astype(int)): at for px, at in zip(query_px, template_px, strict=True)}
+    mine = {
+        tuple(np.rint(px).astype(int)): at
+        for px, at in zip(ours.query_px.numpy(), ours.template_px.numpy(), strict=True)
+    }
+    shared = there.keys() & mine.keys()
+    assert len(shared) >= 0.99 * max(len(there), len(mine))  # equal similarities may be told apart otherwise
+    off = np.array([np.linalg.norm(there[px] - mine[px]) for px in shared])
+    assert np.mean(off < 1e-3) > 0.99
+
+
+def test_the_whole_route_ends_at_the_references_pose(made, plain):
+    best = trace_pose(PAPER, made.query, made.bank).best
+    template_id, T_reference = plain.pose()
+    assert best.template_id == template_id == 0
+    assert best.solution is not None
+    points = best.points_obj[best.solution.inliers]
+    ours, theirs, true = (
+        camera.project(made.query.K, rigid.transform(T, points))
+        for T in (best.solution.T_cam_obj, T_reference, made.T_true)
+    )
+    # RANSAC's draws differ; both polish on the inliers
+    assert np.median(np.linalg.norm(ours - theirs, axis=1)) < 0.3
+    assert np.median(np.linalg.norm(ours - true, axis=1)) < 1.5
