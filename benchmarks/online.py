@@ -14,6 +14,7 @@ from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.functional.similarity import unit
 from pipeline.route import Stages, trace_pose
+from pipeline.stages.choose.inliers import Inliers
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.crop.square import Square
@@ -35,6 +36,7 @@ _CHOSEN: dict[str, Any] = {
     "cluster": KMEANS,
     "correspond": Corresponder(),
     "solve": Epnp(),
+    "choose": Inliers(),
     "refine": NoRefinement(),
     "detect": GtMask(),
 }

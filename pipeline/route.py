@@ -140,7 +140,7 @@ class TemplateBank(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one template led to; ``solution`` None with the ``failure`` that stopped it. ``worth``: choose's."""
+    """What one template led to; ``solution`` None with the ``failure`` that stopped it."""
 
     template_id: int
     template_score: float
@@ -150,7 +150,6 @@ class Hypothesis:
     points_obj: Float[np.ndarray, "m 3"] | None = None
     query_px_img: Float[np.ndarray, "m 2"] | None = None
     solution: PoseSolution | None = None
-    worth: float = -1.0
     failure: NoPose | None = None
 
     @property
@@ -202,7 +201,9 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
         match = _match(stages, query, bank)
     ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
     hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
-    hypotheses.sort(key=lambda h: -h.worth)  # stable: equals stay in the order of their templates
+    if len(hypotheses) > 1:
+        with clock("choose"):  # stable: equals stay in the order of their templates
+            hypotheses.sort(key=lambda h: -_worth(stages, query, bank, h))
     hypotheses[0] = _refined(stages, query, bank, hypotheses[0], clock)
     return Trace(match, tuple(hypotheses), clock.times_s)
 
@@ -243,10 +244,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
             seen = np.isfinite(points_obj).all(1)
             if seen.sum() < MIN_POINTS:
                 raise NoPose("lift", f"{seen.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
-            solution = _solved(stages, query, points_obj, query_px_img, seen)
-            parts["solution"] = solution
-        with clock("choose"):
-            parts["worth"] = _worth(stages, query, template, pair, solution)
+            parts["solution"] = _solved(stages, query, points_obj, query_px_img, seen)
     except NoPose as failure:
         parts["failure"] = failure
     return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
@@ -291,11 +289,13 @@ def _template_cells(
     return template_px, lift(px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
 
 
-def _worth(stages: Stages, query: Query, template: TemplateView, pair: FusedPair, solution: PoseSolution) -> float:
-    """What choose makes of a solved hypothesis."""
-    _, points_obj = _template_cells(stages, template, pair)
-    inliers, K_crop = int(solution.inliers.sum()), query.A_crop_img @ query.K
-    return stages.choose(solution.T_cam_obj, inliers, pair, points_obj, K_crop, crop_size=stages.crop.size)
+def _worth(stages: Stages, query: Query, bank: TemplateBank, found: Hypothesis) -> float:
+    """What choose makes of a hypothesis; less than of any other where there is no pose."""
+    if found.solution is None or found.pair is None:
+        return -1.0
+    _, points_obj = _template_cells(stages, bank.view(found.template_id), found.pair)
+    K_crop, size = query.A_crop_img @ query.K, stages.crop.size
+    return stages.choose(found.solution.T_cam_obj, found.inliers, found.pair, points_obj, K_crop, crop_size=size)
 
 
 def _refined(stages: Stages, query: Query, bank: TemplateBank, best: Hypothesis, clock: Clock) -> Hypothesis:
