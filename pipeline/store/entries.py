@@ -21,13 +21,13 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 from zarr.core.sync import sync
-from zarr.errors import BaseZarrError
+from zarr.errors import BaseZarrError, ContainsArrayError, ContainsGroupError
 
 from pipeline.errors import DzopError
 from pipeline.spec import canonical
 from pipeline.store.backends import Backend, StoreConfig
 from pipeline.store.keys import Ref
-from pipeline.store.seal import FORMAT, completeness, finish, metadata_digest
+from pipeline.store.seal import completeness, finished, identity, metadata_digest
 
 _WRITE_ZEROS: Any = {"write_empty_chunks": True}
 _UNREADABLE = (BaseZarrError, ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError, IsADirectoryError)
@@ -67,6 +67,7 @@ class Store:
     """The feature store. pipeline/graph is its only caller; a step that does without it computes the same values."""
 
     def __init__(self, config: StoreConfig, announce: Callable[[str], None] = lambda text: None) -> None:
+        self.config = config
         self.backend: Backend = config.open()
         self.announce = announce
 
@@ -120,8 +121,8 @@ class Store:
     def put_document(self, ref: Ref, document: Any, *, rows: int, time_s: float = 0.0) -> None:
         """A whole entry without arrays: one JSON document, written at once."""
         with self._exclusive([ref]):
-            group = self._fresh(ref)
-            finish(group, ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
+            attributes = finished(ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
+            self._open(ref, attributes).attrs.put(attributes)
 
     def fill(
         self,
@@ -155,10 +156,11 @@ class Store:
             seconds = time.perf_counter() - start
             for ref, layouts in open_refs.items():
                 nbytes = sum(layout.nbytes(rows) for layout in layouts.values())
-                group = self._group(ref.path)
-                if group is None:
+                group, written = self._group(ref.path), arrays[ref]
+                if group is None or any(len(self.chunks_present(array)) < rows for array in written.values()):
                     raise self._damaged(ref, "it was removed while it was written")
-                finish(group, ref, arrays[ref], dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
+                told = finished(ref, written, dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
+                group.attrs.put(told)
         return Filled(computed, rows - computed, seconds)
 
     def _announce_for(self, ref: Ref, text: str) -> None:
@@ -182,25 +184,43 @@ class Store:
                     raise DzopError(f"{self.place}: the store is read-only here and lacks {refs[0].path}") from None
                 raise
 
-    def _fresh(self, ref: Ref) -> zarr.Group:
-        """An empty group that says what it will be made from."""
-        if self._group(ref.path) is not None or self.keys_below(ref.path):
-            sync(self.backend.zarr.delete_dir(ref.path))
-        attributes = {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
-        return zarr.open_group(self.backend.zarr, path=ref.path, mode="w", attributes=attributes)
+    # Without locks (S3) two may write one entry at once. They write the same bytes, so each leaves what the other has
+    # put there, and removes only what no writer of this entry can have put. Keys are listed before their metadata is
+    # read: metadata is written first, so a key that was listed has metadata that can be read, unless it is broken.
+
+    def _open(self, ref: Ref, attributes: Mapping[str, Any]) -> zarr.Group:
+        """The entry's group, with these attributes when it was not there."""
+        keys, group = self.keys_below(ref.path), self._group(ref.path)
+        if group is not None and group.attrs.get("key") == ref.key:
+            return group
+        if keys:
+            self.delete(ref.path)
+        try:
+            return zarr.create_group(self.backend.zarr, path=ref.path, attributes=dict(attributes))
+        except ContainsGroupError:
+            return zarr.open_group(self.backend.zarr, path=ref.path, mode="r+", zarr_format=3)
 
     def _arrays(self, ref: Ref, layouts: Mapping[str, Layout], rows: int) -> dict[str, zarr.Array]:
         """The entry's arrays: those of an interrupted run when they are of this layout, otherwise new ones."""
-        group = self._group(ref.path)
-        if group is not None and group.attrs.get("key") == ref.key:
-            for key in self.keys_below(ref.path):
-                if key.endswith(".partial"):  # half a chunk of a killed run; the lock is ours, nobody writes it
-                    sync(self.backend.zarr.delete(key))
-            found = {name: self._array(group, name) for name in layouts}
-            if all(_fits(found[name], layout, rows) for name, layout in layouts.items()):
-                return {name: array for name, array in found.items() if array is not None}
-        group = self._fresh(ref)
-        return {name: _create(group, name, layout, rows) for name, layout in layouts.items()}
+        group = self._open(ref, identity(ref))
+        for key in self.keys_below(ref.path):
+            if key.endswith(".partial"):  # half a chunk of a killed run; only a disk has them, and the lock is ours
+                sync(self.backend.zarr.delete(key))
+        return {name: self._array_of(group, name, layout, rows) for name, layout in layouts.items()}
+
+    def _array_of(self, group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Array:
+        path = f"{group.path}/{name}"
+        keys, found = self.keys_below(path), self._array(group, name)
+        if found is not None and _fits(found, layout, rows):
+            return found
+        if keys:
+            self.delete(path)
+        try:
+            return _create(group, name, layout, rows)
+        except ContainsArrayError:
+            made = self._array(group, name)
+            assert made is not None
+            return made
 
     def _rows_done(self, ref: Ref, arrays: Mapping[str, zarr.Array]) -> set[int]:
         """Rows whose chunks are present and pass their checksum in every array."""
@@ -351,9 +371,8 @@ def _create(group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Arr
     )
 
 
-def _fits(array: zarr.Array | None, layout: Layout, rows: int) -> bool:
-    shape = (rows, *layout.row)
-    return array is not None and array.shape == shape and array.dtype == np.dtype(layout.dtype)
+def _fits(array: zarr.Array, layout: Layout, rows: int) -> bool:
+    return array.shape == (rows, *layout.row) and array.dtype == np.dtype(layout.dtype)
 
 
 def _readable(array: zarr.Array, row: int) -> bool:
