@@ -31,7 +31,7 @@ from pipeline.errors import BadInput, DzopError
 from pipeline.route import Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
 from pipeline.score_cli import lint_command, score_command
-from pipeline.spec import Runtime, build
+from pipeline.spec import build
 from pipeline.store import Store
 from pipeline.whole import write_whole
 
@@ -134,7 +134,7 @@ def _job(config: DictConfig, *, sweeping: bool) -> None:
         stages=stages_of(values),
         dataset=variant(values["dataset"], "dataset"),
         store=Store(variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),
-        runtime=build(Runtime, values["runtime"], where="runtime"),
+        runtime=variant(values["runtime"], "runtime"),
         options=options_of(values, resume=sweeping),
     )
 

@@ -114,20 +114,28 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     remember_in(None if store.backend.folder is None else store.backend.folder / ".digests")
     data = dataset.open()
     targets = options.select.of(data)
-    graph = Graph(Context(stages, data, targets, store, runtime, Tally(runtime.progress)))
+    context = Context(stages, data, targets, store, runtime, Tally(runtime.progress))
+    with runtime.workers(context, threads=options.threads) as context.workers:
+        if _steps(Graph(context), options):
+            print(f"\n{context.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+
+
+def _steps(graph: Graph, options: Options) -> bool:
+    """The steps asked for; returns whether they are more than a plan."""
     graph.check()
-    print(_headline(options, stages, data, targets, store), flush=True)
+    run = graph.run
+    print(_headline(options, run.stages, run.dataset, run.targets, run.store), flush=True)
     if options.plan:
         scores = _scores(graph, options)
         print(plan_table([*graph.plan(), *([scores.node()] if scores and graph.detections.known else [])]))
-        return
+        return False
     if options.step == "onboard":
         graph.onboard()
     elif options.step == "detect":
         _detect(graph, options)
     else:
         _estimate(graph, options)
-    print(f"\n{graph.run.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+    return True
 
 
 def _detect(graph: Graph, options: Options) -> None:

@@ -15,6 +15,8 @@ poses, ground truth -> scores                                                   
 
 from __future__ import annotations
 
+from typing import Any
+
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
@@ -25,13 +27,14 @@ from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.graph.work import Counts, Work, Workers
 from pipeline.items.features import SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
 from pipeline.stages.fuse import TrainedFuser
 
-__all__ = ["Context", "Graph", "Judged", "Node", "Retraced", "ScoreNodes"]
+__all__ = ["Context", "Counts", "Graph", "Judged", "Node", "Retraced", "ScoreNodes", "Workers"]
 
 
 class Graph:
@@ -69,10 +72,24 @@ class Graph:
 
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
-        for obj_id in self.run.object_ids:
-            self.templates.onboard(obj_id)
-            if self.detections.proposals and not self.detections.known:
-                self.detections.proposals.make_template_features(obj_id)
+        kinds = [self.templates.onboarding]
+        if self.detections.proposals and not self.detections.known:
+            kinds.append(self.detections.proposals.describing)
+        with self.run.tally.bar(len(kinds) * len(self.run.object_ids), "onboarding", "object") as advance:
+            for work in kinds:
+                self.run.each(work, self.run.object_ids, advance)
+
+    def do(self, work: str, unit: Any) -> Counts:
+        """One unit of a kind of work, for whoever asks for it by name; returns what was computed for it."""
+        before: list[Work[Any]] = [self.templates.onboarding]
+        if self.detections.proposals:
+            before += [self.detections.proposals.describing, self.detections.proposals.proposing_all]
+        after: list[Work[Any]] = [self.queries.describing, self.poses.solving]
+        if work in [kind.name for kind in after]:
+            self.detect()
+        self.run.tally.counts.clear()
+        next(kind for kind in before + after if kind.name == work).do(unit, lambda rows: None)
+        return dict(self.run.tally.counts)
 
     def detect(self) -> list[Detection]:
         """Detections of all targets, those that cannot be used included."""
