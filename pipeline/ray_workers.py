@@ -7,7 +7,9 @@ done by the next worker that is free: the store keeps what was complete of it.
 
 from __future__ import annotations
 
+import logging
 import os
+import socket
 import sys
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
@@ -26,10 +28,12 @@ try:
     import ray
     from ray import exceptions as faults
 except ImportError:
-    ray = None
+    ray = None  # type: ignore[assignment]
 
 _STORE_BYTES = 100_000_000  # results travel through our store, so that Ray's own may be small
 _PATIENCE_S = 30.0
+_REACH_S = 10.0
+_ADDRESSES = "local, auto where `ray start` has run, host:6379 or ray://host:10001"
 
 
 @spec
@@ -77,7 +81,8 @@ class RayWorkers:
     def each(self, work: str, units: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
         """As Workers.each."""
         self._start(len(units))
-        waiting, lost, busy = deque(units), Counter[Any](), {}
+        waiting, lost = deque(units), Counter[Any]()
+        busy: dict[Any, tuple[Any, Any]] = {}
         while waiting or busy:
             while waiting and self._idle:
                 worker, unit = self._idle.pop(), waiting.popleft()
@@ -91,8 +96,8 @@ class RayWorkers:
                 except (faults.RayActorError, faults.WorkerCrashedError, faults.ObjectLostError) as error:
                     lost[unit] += 1
                     if lost[unit] > self.runtime.retries:
-                        told = f"lost {lost[unit]} workers, the last with: {_brief(error)}"
-                        raise DzopError(f"{work} of {unit}: {told}; often for want of memory: fewer runtime.actors") from None
+                        told = f"{work} of {unit}: lost {lost[unit]} workers, the last with: {_brief(error)}"
+                        raise DzopError(f"{told}; often for want of memory: fewer runtime.actors") from None
                     self._say(f"{work} of {unit}: its worker was lost; another goes on with it")
                     waiting.appendleft(unit)
                     self._hire()
@@ -134,8 +139,8 @@ class RayWorkers:
             self._hire()
 
     def _hire(self) -> None:
-        asked = {"num_cpus": self.runtime.cpus_per_actor, "num_gpus": self._gpus}
-        worker = ray.remote(**asked)(Worker).remote(self._site)
+        actor: Any = ray.remote(num_cpus=self.runtime.cpus_per_actor, num_gpus=self._gpus)(Worker)
+        worker = actor.remote(self._site)
         self._starting[worker.ready.remote()] = worker
 
     @property
@@ -193,7 +198,7 @@ class Worker:
 
 def _site_of(run: Context, runtime: Runtime, threads: int) -> dict[str, Any]:
     """All that a worker builds the run's graph from."""
-    plain = Runtime(**{f.name: getattr(runtime, f.name) for f in fields(Runtime)})  # type: ignore[arg-type]
+    plain = Runtime(**{f.name: getattr(runtime, f.name) for f in fields(Runtime)})
     return {
         "run": (run.stages, run.dataset, run.targets, run.store.config),
         "runtime": replace(plain, progress=False),
@@ -218,17 +223,26 @@ def _connect(address: str) -> None:
     """Join a cluster, or make one of this machine: no dashboard, no usage report, its ports guarded by a token."""
     if ray.is_initialized():
         return
+    _check_reachable(address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_DEDUP_LOGS", "0")
     chosen: dict[str, Any] = {"address": address}
     if address == "local":
-        os.environ.setdefault("RAY_AUTH_MODE", "token")
         chosen |= {"include_dashboard": False, "object_store_memory": _STORE_BYTES}
     try:
-        ray.init(**chosen, log_to_driver=False, logging_level="ERROR", configure_logging=False)
+        ray.init(**chosen, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, TimeoutError, ValueError, RuntimeError, faults.RayError) as error:
-        needed = "local, auto where `ray start` has run, host:6379 or ray://host:10001"
-        raise BadInput("runtime.address", found=f"{address} ({_brief(error)})", needed=needed) from None
+        raise BadInput("runtime.address", found=f"{address} ({_brief(error)})", needed=_ADDRESSES) from None
+
+
+def _check_reachable(address: str) -> None:
+    """Raise BadInput at once where nobody listens, for which Ray takes minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon:
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_REACH_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise BadInput("runtime.address", found=f"{address} ({error})", needed=_ADDRESSES) from None
 
 
 def _brief(error: BaseException) -> str:

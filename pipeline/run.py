@@ -117,7 +117,8 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     context = Context(stages, data, targets, store, runtime, Tally(runtime.progress))
     with runtime.workers(context, threads=options.threads) as context.workers:
         if _steps(Graph(context), options):
-            print(f"\n{context.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+            seconds = time.perf_counter() - start
+            print(f"\n{context.tally.table()}\n{'whole run':<20}{'':>20}{seconds:>10.1f}", flush=True)
 
 
 def _steps(graph: Graph, options: Options) -> bool:

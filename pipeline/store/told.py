@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -32,7 +31,7 @@ def told(place: str) -> Iterator[None]:
         raise StoreUnreachable(f"{place}: the bucket does not exist; make it, or mend store.url") from None
     except PermissionError as error:
         raise StoreUnreachable(f"{place}: access denied ({_brief(error)}); check the AWS credentials") from None
-    except (asyncio.TimeoutError, TimeoutError):
+    except TimeoutError:
         raise StoreUnreachable(f"{place}: no answer within store.timeout_s; {_AGAIN}") from None
     except Exception as error:
         if type(error).__name__ == "NoCredentialsError":
