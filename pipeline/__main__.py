@@ -70,7 +70,8 @@ def main() -> None:
 
 def _run_jobs() -> None:
     """The run, or all jobs of a sweep, and then in one line those that failed."""
-    folder = Path(tempfile.gettempdir()) / f"dzop-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
+    shared = Path.cwd() if os.access(Path.cwd(), os.W_OK) else Path(tempfile.gettempdir())  # jobs on other nodes see it
+    folder = shared / f".dzop-failed-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
     os.environ[FAILED] = str(folder)
     try:
         _hydra_main()
@@ -108,7 +109,8 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
-    write_whole(Path(os.environ[FAILED]) / f"{number:06d}", f"{' '.join(overrides)} ({message})")
+    if folder := os.environ.get(FAILED):  # Ray's launcher does not take it to another machine: there the row must do
+        write_whole(Path(folder) / f"{number:06d}", f"{' '.join(overrides)} ({message})")
     values = cast(dict[str, Any], _writable(OmegaConf.to_container(config, resolve=True)))
     note_failure(values["out"], values, overrides, message)
 
