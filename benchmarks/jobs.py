@@ -20,7 +20,6 @@ from omegaconf import OmegaConf
 from benchmarks.measure import Figure, interleaved
 from pipeline.__main__ import CONF, options_of, stages_of, variant
 from pipeline.run import run
-from pipeline.spec import Runtime, build
 from pipeline.store import Store
 
 SMALL = ("dataset=demo", "dataset.objects=6", "dataset.images=8", "dataset.per_image=3", "evaluate.vsd=false")
@@ -40,7 +39,7 @@ def job(folder: Path, *overrides: str) -> None:
             stages=stages_of(values),  # type: ignore[arg-type]
             dataset=variant(values["dataset"], "dataset"),
             store=Store(variant(values["store"], "store")),
-            runtime=build(Runtime, values["runtime"], where="runtime"),
+            runtime=variant(values["runtime"], "runtime"),
             options=options_of(values),  # type: ignore[arg-type]
         )
 

@@ -37,7 +37,7 @@ from pipeline.errors import BadInput, DzopError
 from pipeline.route import Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
 from pipeline.score_cli import lint_command, score_command
-from pipeline.spec import Runtime, build
+from pipeline.spec import build
 from pipeline.store import Store
 from pipeline.whole import write_whole
 
@@ -95,7 +95,8 @@ def _hydras_own(error: BaseException) -> bool:
 
 def _run_jobs() -> None:
     """The run, or all jobs of a sweep, and then in one line those that failed."""
-    folder = Path(tempfile.gettempdir()) / f"dzop-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
+    shared = Path.cwd() if os.access(Path.cwd(), os.W_OK) else Path(tempfile.gettempdir())  # jobs on other nodes see it
+    folder = shared / f".dzop-failed-{os.getpid()}-{time.time_ns()}"  # made by the first that fails
     os.environ[FAILED] = str(folder)
     try:
         _hydra_main()
@@ -153,7 +154,8 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
-    write_whole(Path(os.environ[FAILED]) / f"{number:06d}", json.dumps([overrides, message]))
+    if folder := os.environ.get(FAILED):  # Ray's launcher does not take it to another machine: there the row must do
+        write_whole(Path(folder) / f"{number:06d}", json.dumps([overrides, message]))
     try:
         plain = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException:  # a value that stands for another which is not there
@@ -188,7 +190,7 @@ def _run(values: dict[str, Any], *, resume: bool) -> None:
         stages=stages_of(values),
         dataset=variant(values["dataset"], "dataset"),
         store=Store(variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),
-        runtime=build(Runtime, values["runtime"], where="runtime"),
+        runtime=variant(values["runtime"], "runtime"),
         options=options_of(values, resume=resume),
     )
 

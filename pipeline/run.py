@@ -7,17 +7,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
-import cv2
 import numpy as np
 import torch
 from pydantic import Field
-from threadpoolctl import threadpool_limits
 
 from pipeline.bop.dataset import Dataset
 from pipeline.checkpoints import NotFetched
 from pipeline.digests import remember_in
 from pipeline.errors import BadInput
-from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes
+from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes, use_threads
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors
@@ -112,17 +110,27 @@ class Options:
 def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtime, options: Options) -> None:
     """Run one configuration. Raises DzopError for whatever a user can mend; prints what was done and where it lies."""
     start = time.perf_counter()
-    _use_threads(options.threads)
+    use_threads(options.threads)
     remember_in(None if store.backend.folder is None else store.backend.folder / ".digests")
     data = dataset.open()
     targets = options.select.of(data)
-    graph = Graph(Context(stages, data, targets, store, runtime, Tally(runtime.progress)))
-    if options.plan:
-        _plan(graph, options)
-        return
+    context = Context(stages, data, targets, store, runtime, Tally(runtime.progress))
+    with runtime.workers(context, threads=options.threads) as context.workers:
+        graph = Graph(context)
+        if options.plan:
+            _plan(graph, options)
+            return
+        _steps(graph, options)
+    seconds = time.perf_counter() - start
+    print(f"\n{context.tally.table()}\n{'whole run':<20}{'':>20}{seconds:>10.1f}", flush=True)
+
+
+def _steps(graph: Graph, options: Options) -> None:
+    """The steps asked for."""
     graph.check()
-    _hold_to_vram(graph.run)
-    print(_headline(options, stages, data, targets, store), flush=True)
+    graph.hold_to_vram()
+    run = graph.run
+    print(_headline(options, run.stages, run.dataset, run.targets, run.store), flush=True)
     try:
         if options.step == "onboard":
             graph.onboard()
@@ -132,12 +140,9 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
             _estimate(graph, options)
     except torch.cuda.OutOfMemoryError as error:
         needed = "a smaller runtime.batch (0 = sized to memory), extract.dtype=float16, or more in runtime.max_vram"
-        raise BadInput(
-            f"memory of {graph.run.device}", found=" ".join(str(error).split())[:200], needed=needed
-        ) from None
+        raise BadInput(f"memory of {run.device}", found=" ".join(str(error).split())[:200], needed=needed) from None
     finally:
-        graph.run.rates.save()
-    print(f"\n{graph.run.tally.table()}\n{'whole run':<20}{'':>20}{time.perf_counter() - start:>10.1f}", flush=True)
+        run.rates.save()
 
 
 def _plan(graph: Graph, options: Options) -> None:
@@ -255,20 +260,6 @@ def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float)
         if judged.correspondences:
             error = np.median(list(judged.correspondences.values()))
             print(f"correspondences: median {error:.1%} of the diameter off, parallel to the image")
-
-
-def _hold_to_vram(run: Context) -> None:
-    """What torch keeps of the device's memory for later counts as well."""
-    if run.runtime.vram_bytes is not None and run.device.startswith("cuda"):
-        total = torch.cuda.get_device_properties(run.device).total_memory
-        torch.cuda.set_per_process_memory_fraction(min(1.0, run.runtime.vram_bytes / total), run.device)
-
-
-def _use_threads(threads: int) -> None:
-    if threads:
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
-        threadpool_limits(threads)  # BLAS beneath SciPy, which has threads of its own
 
 
 def _headline(options: Options, stages: Stages, data: Dataset, targets: Sequence[Target], store: Store) -> str:

@@ -16,7 +16,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, dataclass_transform
 
@@ -127,7 +128,7 @@ def _tuples(value: Any) -> Any:
     return value
 
 
-@dataclass(frozen=True, kw_only=True)
+@spec
 class Runtime:
     """How to compute: never part of a key, never a reason for other results.
 
@@ -137,7 +138,7 @@ class Runtime:
     """
 
     device: str = "auto"
-    batch: int = 0
+    batch: NonNegative = 0
     max_vram: str | int | None = None
     max_memory: str | int | None = None
     progress: bool = True
@@ -151,6 +152,10 @@ class Runtime:
     def memory_bytes(self) -> int | None:
         """``max_memory`` in bytes. Raises BadInput for what is no size."""
         return _size_bytes(self.max_memory, "runtime.max_memory")
+
+    def workers(self, run: Any, *, threads: int) -> AbstractContextManager[Any]:
+        """Who does a run's work: None for the process that asks. ``threads`` as in the configuration, 0 for all."""
+        return nullcontext()
 
     def torch_device(self) -> str:
         """Torch's name of the device. Raises BadInput when CUDA is asked for and absent."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -47,6 +47,11 @@ class Tally:
         count.computed += computed
         count.reused += reused
         count.time_s += time_s
+
+    def merge(self, counts: Mapping[str, Count]) -> None:
+        """Add what another process has counted."""
+        for step, count in counts.items():
+            self.add(step, computed=count.computed, reused=count.reused, time_s=count.time_s)
 
     def of(self, step: str) -> Count:
         """The counts of a step so far."""

@@ -41,3 +41,20 @@ def bop_mini() -> Path:
 def bop_reference() -> Path:
     """bop_toolkit's own values of the pose errors."""
     return _shared("reference", "bop_metrics")
+
+
+@pytest.fixture(scope="session")
+def s3_server():
+    """An S3 server on this machine, with credentials in the environment as users have them."""
+    pytest.importorskip("s3fs", reason="needs s3fs: pip install 'dzop[s3]'")
+    pytest.importorskip("moto.server", reason="needs moto's server: pip install 'moto[server]'")
+    from tests.s3_server import S3Server  # imports pipeline, which must come after the hook above
+
+    with S3Server.running() as server:
+        yield server
+
+
+@pytest.fixture
+def s3(s3_server):
+    """The server with an empty bucket."""
+    return s3_server.emptied()

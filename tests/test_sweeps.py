@@ -18,6 +18,7 @@ SMALL = ("render.count=12", "render.size=128", "method=dzop", "extract=hog", "ov
          "runtime.progress=false", "threads=1")  # fmt: skip
 
 JOBLIB = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+SUBMITIT = ("hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10")
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +49,10 @@ def ran(command: list[str]) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", [(), JOBLIB], ids=["basic", "joblib"])
+@pytest.mark.parametrize("launcher", [(), JOBLIB, SUBMITIT], ids=["basic", "joblib", "submitit"])
 def test_a_failed_job_loses_no_other_and_is_listed_at_the_end_and_in_the_rows(command, tmp_path, launcher):
+    if launcher == SUBMITIT:
+        pytest.importorskip("submitit", reason="needs submitit: pip install 'dzop[submitit]'")
     done = ran(command("-m", "cluster.count=4,-1,6", "solve.min_inliers=4", *launcher))
     assert done.returncode == 1
     last = done.stderr.strip().splitlines()[-1]

@@ -17,6 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
+
+import torch
 
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
@@ -30,13 +33,25 @@ from pipeline.graph.queries import QueryNodes
 from pipeline.graph.retrace import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.graph.work import Counts, Work, Workers, use_threads
 from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
 from pipeline.stages.fuse import TrainedFuser
 
-__all__ = ["Context", "Graph", "Judged", "Memory", "Node", "Retraced", "ScoreNodes"]
+__all__ = [
+    "Context",
+    "Counts",
+    "Graph",
+    "Judged",
+    "Memory",
+    "Node",
+    "Retraced",
+    "ScoreNodes",
+    "Workers",
+    "use_threads",
+]
 
 
 class Graph:
@@ -83,12 +98,33 @@ class Graph:
         need = need_of(self.run, self.detections.proposals)
         return memory_of(self.run, need if passes else replace(need, weights=0, footprint=None))
 
+    def hold_to_vram(self) -> None:
+        """What torch keeps of the device's memory for later counts against its budget as well."""
+        vram, device = self.run.runtime.vram_bytes, self.run.device
+        if vram is not None and device.startswith("cuda"):
+            total = torch.cuda.get_device_properties(device).total_memory
+            torch.cuda.set_per_process_memory_fraction(min(1.0, vram / total), device)
+
     def onboard(self) -> None:
         """Everything offline, for every object of the targets."""
-        for obj_id in self.run.object_ids:
-            self.templates.onboard(obj_id)
-            if self.detections.proposals and not self.detections.known:
-                self.detections.proposals.make_template_features(obj_id)
+        kinds = [self.templates.onboarding]
+        if self.detections.proposals and not self.detections.known:
+            kinds.append(self.detections.proposals.describing)
+        with self.run.tally.bar(len(kinds) * len(self.run.object_ids), "onboarding", "object") as advance:
+            for work in kinds:
+                self.run.each(work, self.run.object_ids, advance)
+
+    def do(self, work: str, unit: Any) -> Counts:
+        """One unit of a kind of work, for whoever asks for it by name; returns what was computed for it."""
+        before: list[Work[Any]] = [self.templates.onboarding]
+        if self.detections.proposals:
+            before += [self.detections.proposals.describing, self.detections.proposals.proposing_all]
+        after: list[Work[Any]] = [self.queries.describing, self.poses.solving]
+        if work in [kind.name for kind in after]:
+            self.detect()
+        self.run.tally.counts.clear()
+        next(kind for kind in before + after if kind.name == work).do(unit, lambda rows: None)
+        return dict(self.run.tally.counts)
 
     def detect(self) -> list[Detection]:
         """Detections of all targets, those that cannot be used included."""

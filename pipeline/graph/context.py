@@ -12,9 +12,10 @@ import torch
 from jaxtyping import Float
 
 from pipeline.bop.dataset import Dataset
-from pipeline.errors import DzopError
+from pipeline.errors import BadInput, DzopError
 from pipeline.graph.kept import Kept
 from pipeline.graph.rates import Rates, work_of
+from pipeline.graph.work import Advance, Unit, Work, Workers
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crops, Target
 from pipeline.route import Stages
@@ -31,7 +32,7 @@ ImageId = tuple[int, int]
 
 @dataclass(eq=False)
 class Context:
-    """One run: its stages, data, store and counts."""
+    """One run: its stages, data, store and counts. ``workers``: who does its work, None for this process alone."""
 
     stages: Stages
     dataset: Dataset
@@ -39,6 +40,7 @@ class Context:
     store: Store
     runtime: Runtime
     tally: Tally = field(default_factory=Tally)
+    workers: Workers | None = None
 
     @cached_property
     def object_ids(self) -> list[int]:
@@ -77,6 +79,18 @@ class Context:
     def tensor(self, values: np.ndarray) -> torch.Tensor:
         """Stored values on the device."""
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    def each(self, work: Work[Unit], units: Sequence[Unit], advance: Advance) -> None:
+        """Do every unit of work, here or by the run's workers; what is there already never leaves this process."""
+        away = [] if self.workers is None else [unit for unit in units if not work.done(unit)]
+        for unit in units if not away else set(units).difference(away):
+            work.do(unit, advance)
+        for unit, counts in self.workers.each(work.name, away) if self.workers and away else ():
+            self.tally.merge(counts)
+            if not work.done(unit):
+                found = f"that a worker has finished {work.name} of {unit}, and nothing of it in {self.store.place}"
+                raise BadInput("runtime", found=found, needed="workers that see the same files and the same store")
+            advance(work.size(unit))
 
     # --- entries of one kind -----------------------------------------------------------------------------------------
 

@@ -71,15 +71,14 @@ class DetectionNodes:
         if not isinstance(detect, DescribingDetector):
             return detect(self.run.dataset, self.run.targets)
         assert self.proposals is not None
-        for obj_id in self.run.object_ids:
-            self.proposals.make_template_features(obj_id)
+        with self.run.tally.bar(len(self.run.object_ids), "descriptions", "object") as advance:
+            self.run.each(self.proposals.describing, self.run.object_ids, advance)
         templates = {obj_id: self.proposals.template_descriptors(obj_id) for obj_id in self.run.object_ids}
         found: list[Detection] = []
-        with self.run.tally.bar(len(self.run.image_ids), "detections", "image") as advance:
-            for image in self.run.image_ids:
-                self.proposals.make(image)
-                targets = [t for t in self.run.targets if (t.scene_id, t.im_id) == image]
-                described = self.proposals.described(image)
-                found += detect.by_description(targets, *described, templates, self.proposals.time_s(image))
-                advance(1)
+        with self.run.tally.bar(len(self.run.image_ids), "proposals", "image") as advance:
+            self.run.each(self.proposals.proposing_all, self.run.image_ids, advance)
+        for image in self.run.image_ids:
+            targets = [t for t in self.run.targets if (t.scene_id, t.im_id) == image]
+            described = self.proposals.described(image)
+            found += detect.by_description(targets, *described, templates, self.proposals.time_s(image))
         return found

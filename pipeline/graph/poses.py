@@ -12,6 +12,7 @@ from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import Found, QueryNodes
 from pipeline.graph.rates import work_of
 from pipeline.graph.templates import StoredBank, TemplateNodes
+from pipeline.graph.work import Advance, Work
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_of, record_of
 from pipeline.items.views import Detection, Target
@@ -82,17 +83,14 @@ class PoseNodes:
         self._make_queries(sorted({(t.scene_id, t.im_id) for group in missing for t in self.groups[group]}))
         total = sum(len(self.groups[group]) for group in missing)
         with self.run.tally.bar(total, "poses", "target") as advance:
-            for group in sorted(missing, key=lambda group: group[1]):
-                self._make_poses(group, advance)
+            self.run.each(self.solving, sorted(missing, key=lambda group: group[1]), advance)
         made = [self.run.store.read(self.poses(group)).document["answers"] for group in self.groups]
         records = [record for answers in made for record in answers]
         self.run.store.put_document(ref, {"answers": records}, rows=len(records))
 
     def _make_queries(self, images: Sequence[ImageId]) -> None:
         with self.run.tally.bar(len(images), "query features", "image") as advance:
-            for image in images:
-                self.queries.make_features(image, self.queries.make_crops(image))
-                advance(1)
+            self.run.each(self.queries.describing, images, advance)
 
     def _count_reused(self, answers: int) -> None:
         """Whatever this run stands on and did not compute was reused."""
@@ -101,7 +99,13 @@ class PoseNodes:
             count = self.run.tally.of(step)
             self.run.tally.add(step, reused=max(0, rows - count.computed - count.reused))
 
-    def _make_poses(self, group: tuple[int, int], advance: Callable[[int], None]) -> None:
+    @cached_property
+    def solving(self) -> Work[tuple[int, int]]:
+        """Poses, by scene and object."""
+        done, size = self.run.store.complete, self.groups
+        return Work("poses", self._solve, lambda group: done(self.poses(group)), lambda group: len(size[group]))
+
+    def _solve(self, group: tuple[int, int], advance: Advance) -> None:
         ref, (_, obj_id) = self.poses(group), group
         bank, began = self.templates.bank(obj_id), time.perf_counter()
         answers: list[Answer] = []

@@ -17,6 +17,7 @@ from pipeline.errors import BadInput, NoPose
 from pipeline.functional.descriptors import pooled
 from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.templates import TemplateNodes
+from pipeline.graph.work import Advance, Work
 from pipeline.items.records import proposal_of, proposal_record
 from pipeline.items.views import Crops, Proposal
 from pipeline.spec import digest
@@ -67,11 +68,19 @@ class ProposalNodes:
         """Features of an object's templates that descriptors are read from."""
         return self.templates.features(obj_id, self.detector.describe_layer)
 
-    def make_template_features(self, obj_id: int) -> None:
-        """Render, crop and describe what is missing of an object's templates."""
+    @cached_property
+    def describing(self) -> Work[int]:
+        """Rendering, cropping and describing templates, by object."""
+        return Work("descriptions", self._describe, lambda obj_id: self._complete(self.template_features(obj_id)))
+
+    def _complete(self, ref: Ref) -> bool:
+        return self.run.store.complete(ref)
+
+    def _describe(self, obj_id: int, advance: Advance) -> None:
         count = self.templates.make_templates(obj_id)
         self.templates.make_crops(obj_id, count)
         self.templates.make_features(obj_id, count, [self.detector.describe_layer])
+        advance(1)
 
     def template_descriptors(self, obj_id: int) -> Float[torch.Tensor, "n c"]:
         """One vector for each of an object's templates."""
@@ -100,12 +109,22 @@ class ProposalNodes:
         """Features of these that descriptors are read from; none for an image without a crop."""
         return self.run.features(self.detector.describe_layer, {"crops": self.crops(image).key})
 
-    def make(self, image: ImageId) -> None:
-        """Propose, crop and describe what is missing of an image's proposals."""
+    @cached_property
+    def proposing_all(self) -> Work[ImageId]:
+        """Proposing, cropping and describing, by image."""
+        return Work("proposals", self._make, self._made)
+
+    def _made(self, image: ImageId) -> bool:
+        if not (self._complete(self.proposals(image)) and self._complete(self.crops(image))):
+            return False
+        return not self.run.store.read(self.crops(image)).rows or self._complete(self.features(image))
+
+    def _make(self, image: ImageId, advance: Advance) -> None:
         rows = self._make_crops(image, self._make_proposals(image))
         if rows:
             refs = {self.detector.describe_layer: self.features(image)}
             self.run.extract("proposal features", "", refs, rows, lambda some: self._crops_of(image, some))
+        advance(1)
 
     def described(self, image: ImageId) -> tuple[list[Proposal], Float[torch.Tensor, "p c"]]:
         """An image's proposals that have a crop, and one vector for each."""

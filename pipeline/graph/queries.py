@@ -16,6 +16,7 @@ from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.rates import work_of
+from pipeline.graph.work import Advance, Work
 from pipeline.items.views import Crops, Detection, Geometry
 from pipeline.route import Query
 from pipeline.spec import digest
@@ -84,6 +85,22 @@ class QueryNodes:
             ]
             inputs["geometry"] = digest([poses, self.run.K(image).tolist()])
         return self.run.features(layer, inputs)
+
+    @cached_property
+    def describing(self) -> Work[ImageId]:
+        """Crops and features of an image's detections, by image."""
+        return Work("query features", self._describe, self._described)
+
+    def _described(self, image: ImageId) -> bool:
+        complete = self.run.store.complete
+        if not complete(self.crops(image)):
+            return False
+        layers = self.run.stages.layers
+        return not self.found(image) or all(complete(self.features(image, layer)) for layer in layers)
+
+    def _describe(self, image: ImageId, advance: Advance) -> None:
+        self.make_features(image, self.make_crops(image))
+        advance(1)
 
     def make_crops(self, image: ImageId) -> list[Found]:
         """Crop an image's detections; those that cannot be cropped are left out, with their reason."""

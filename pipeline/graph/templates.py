@@ -13,6 +13,7 @@ import torch
 from pipeline.errors import DzopError
 from pipeline.graph.context import Context, stacked
 from pipeline.graph.rates import work_of
+from pipeline.graph.work import Advance, Work
 from pipeline.items.features import TemplateCells
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.route import TemplateView
@@ -192,12 +193,23 @@ class TemplateNodes:
             template.append(part.template + first)
         return TemplateCells(torch.cat(features), torch.cat(template), crops.rows)
 
-    def onboard(self, obj_id: int) -> None:
-        """Everything offline of one object."""
+    @cached_property
+    def onboarding(self) -> Work[int]:
+        """Everything offline, by object."""
+        return Work("onboarding", self._onboard, self._onboarded)
+
+    def _onboarded(self, obj_id: int) -> bool:
+        refs = [self.templates(obj_id), self.crops(obj_id)]
+        refs += [self.features(obj_id, layer) for layer in self.run.stages.layers]
+        refs += [self.fitted(obj_id, fit) for fit in self.run.stages.fits]
+        return all(map(self.run.store.complete, refs))
+
+    def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.run.stages.layers)
         self.make_fitted(obj_id)
+        advance(1)
 
     def feature_bytes(self) -> int:
         """What the stored features of all objects take."""

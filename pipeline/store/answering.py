@@ -17,10 +17,46 @@ T = TypeVar("T")
 
 _ANSWERS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, KeyError, DzopError)
 """What says that something is not there: an answer like any other."""
+_KEPT = "what is complete is kept"
+
+
+class StoreUnreachable(DzopError):
+    """A store behind a network that did not answer, or answered no. Nothing is known of its entries."""
+
+
+@contextmanager
+def told(place: str) -> Iterator[None]:
+    """Whatever keeps ``place`` from answering (timeouts, refusals, lost connections) as StoreUnreachable, in one line.
+
+    FileNotFoundError stays what it is, a key that is not there, but where a bucket is missing.
+    """
+    try:
+        yield
+    except _ANSWERS as error:
+        if "bucket does not exist" not in str(error) or isinstance(error, DzopError):
+            raise
+        raise StoreUnreachable(f"{place}: the bucket does not exist; make it, or mend store.url") from None
+    except PermissionError as error:
+        needed = f"check the AWS credentials, then run again: {_KEPT}"
+        raise StoreUnreachable(f"{place}: access denied ({_brief(error)}); {needed}") from None
+    except Exception as error:
+        if type(error).__name__ == "NoCredentialsError":
+            needed = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or store.anonymous=true"
+            raise StoreUnreachable(f"{place}: found no AWS credentials; {needed}") from None
+        reason = f"{type(error).__name__}: {_brief(error)}"
+        if isinstance(error, TimeoutError):
+            reason = "no answer within store.timeout_s"
+        raise StoreUnreachable(
+            f"{place}: the store does not answer ({reason}); run again when it answers: {_KEPT}"
+        ) from None
+
+
+def _brief(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 class Answering(WrapperStore[ZarrStore]):
-    """The wrapped store; what it raises but answers (timeouts, refusals, lost connections) becomes a DzopError."""
+    """The wrapped store; what it raises but answers becomes StoreUnreachable."""
 
     def __init__(self, store: ZarrStore, place: str = "") -> None:
         super().__init__(store)
@@ -29,24 +65,12 @@ class Answering(WrapperStore[ZarrStore]):
     def _with_store(self, store: ZarrStore) -> Answering:
         return Answering(store, self.place)
 
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        try:
-            yield
-        except _ANSWERS:
-            raise
-        except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            raise DzopError(
-                f"{self.place}: the store does not answer ({reason}); run again when it does: what is complete is kept"
-            ) from None
-
     async def _answer(self, asked: Awaitable[T]) -> T:
-        with self._told():
+        with told(self.place):
             return await asked
 
     async def _answers(self, asked: AsyncIterator[T]) -> AsyncIterator[T]:
-        with self._told():
+        with told(self.place):
             async for item in asked:
                 yield item
 

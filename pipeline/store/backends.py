@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import threading
 from collections import defaultdict
 from collections.abc import Callable
@@ -13,11 +14,12 @@ from typing import ClassVar, Protocol
 
 from filelock import FileLock, Timeout
 from zarr.abc.store import Store as ZarrStore
+from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
 from pipeline.errors import BadInput, DzopError
-from pipeline.spec import Spec, spec
-from pipeline.store.answering import Answering
+from pipeline.spec import PositiveFloat, Spec, spec
+from pipeline.store.answering import Answering, told
 
 Announce = Callable[[str], None]
 
@@ -102,23 +104,45 @@ class MemoryStoreConfig(Spec):
 class S3StoreConfig(Spec):
     """Any S3-compatible bucket (``pip install dzop[s3]``), so that workers share one cache.
 
-    There is no lock: two workers that want the same entry both compute it and write the same bytes.
+    There is no lock: two workers that want the same entry both compute it and write the same bytes. ``timeout_s``:
+    how long a request may take; it is sent up to six times, with pauses, before the run ends.
     """
 
     kind: ClassVar[str] = "store.s3"
     url: str
     endpoint_url: str | None = None
     anonymous: bool = False
+    timeout_s: PositiveFloat = 20.0
 
     def open(self) -> Backend:
-        """The bucket and prefix of ``url``."""
-        if not self.url.startswith("s3://"):
+        """The bucket and prefix of ``url``. Raises BadInput, StoreUnreachable for one that cannot be listed."""
+        if not self.url.startswith("s3://") or not self.url.removeprefix("s3://").strip("/"):
             raise BadInput("store.url", found=repr(self.url), needed="s3://bucket/prefix")
-        options: dict[str, object] = {"anon": self.anonymous}
-        if self.endpoint_url:
-            options["client_kwargs"] = {"endpoint_url": self.endpoint_url}
+        options = {
+            "anon": self.anonymous,
+            "endpoint_url": self.endpoint_url,
+            "config_kwargs": {
+                "connect_timeout": self.timeout_s,
+                "read_timeout": self.timeout_s,
+                "retries": {"total_max_attempts": 3, "mode": "standard"},
+            },
+            "use_listings_cache": False,  # other workers write there too
+        }
+        logging.getLogger("aiobotocore.credentials").setLevel(logging.WARNING)  # that it found them is no news
         try:
-            store = FsspecStore.from_url(self.url, storage_options=options)
+            store = FsspecStore.from_url(self.url.rstrip("/"), storage_options=options)
         except ImportError:
             raise BadInput("store", found="s3 without s3fs", needed="pip install 'dzop[s3]'") from None
+        store.fs.retries = 2  # each of three attempts
+        sync(_check_bucket(store, self.url))
         return Backend(Answering(store, self.url), self.url, None, lambda key, say: nullcontext())
+
+
+async def _check_bucket(store: FsspecStore, url: str) -> None:
+    """Raise in one line, before any work, when the bucket is not there or not ours to list."""
+    bucket, _, prefix = store.path.partition("/")
+    with told(url):
+        try:
+            await store.fs._call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, MaxKeys=1)
+        except ValueError as error:  # botocore's word on an endpoint that is no URL
+            raise BadInput("store.endpoint_url", found=error, needed="a URL, http://host:port") from None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -21,7 +20,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 from zarr.core.sync import sync
-from zarr.errors import BaseZarrError
+from zarr.errors import BaseZarrError, ContainsArrayError, ContainsGroupError
 from zarr.storage import MemoryStore
 
 from pipeline.errors import DzopError
@@ -29,7 +28,7 @@ from pipeline.spec import canonical
 from pipeline.store.backends import Backend, StoreConfig
 from pipeline.store.chunks import plain, read_rows
 from pipeline.store.keys import Ref
-from pipeline.store.seal import FORMAT, completeness, finish, metadata_digest
+from pipeline.store.seal import completeness, finished, identity, metadata_digest
 
 _WRITE_ZEROS: Any = {"write_empty_chunks": True}
 _UNREADABLE = (BaseZarrError, ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError, IsADirectoryError)
@@ -69,6 +68,7 @@ class Store:
     """The feature store. pipeline/graph is its only caller; a step that does without it computes the same values."""
 
     def __init__(self, config: StoreConfig, announce: Callable[[str], None] = lambda text: None) -> None:
+        self.config = config
         self.backend: Backend = config.open()
         self.announce = announce
 
@@ -127,8 +127,8 @@ class Store:
         with self._exclusive([ref]):
             if self.complete(ref):
                 return
-            group = self._fresh(ref)
-            finish(group, ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
+            attributes = finished(ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
+            self._open(ref, attributes).attrs.put(attributes)
 
     def fill(
         self,
@@ -162,10 +162,11 @@ class Store:
             seconds = time.perf_counter() - start
             for ref, layouts in open_refs.items():
                 nbytes = sum(layout.nbytes(rows) for layout in layouts.values())
-                group = self._group(ref.path)
-                if group is None:
+                group, written = self._group(ref.path), arrays[ref]
+                if group is None or any(len(self.chunks_present(array)) < rows for array in written.values()):
                     raise self._damaged(ref, "it was removed while it was written")
-                finish(group, ref, arrays[ref], dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
+                told = finished(ref, written, dict(document or {}), rows=rows, time_s=seconds, nbytes=nbytes)
+                group.attrs.put(told)
         return Filled(computed, rows - computed, seconds)
 
     def _announce_for(self, ref: Ref, text: str) -> None:
@@ -189,11 +190,27 @@ class Store:
                     raise DzopError(f"{self.place}: the store is read-only here and lacks {refs[0].path}") from None
                 raise
 
-    def _fresh(self, ref: Ref) -> zarr.Group:
-        """An empty group that says what it will be made from."""
-        if self._group(ref.path) is not None or self.keys_below(ref.path):
-            sync(self.backend.zarr.delete_dir(ref.path))
-        return zarr.open_group(self.backend.zarr, path=ref.path, mode="w", attributes=_header(ref))
+    # Without locks (S3) two may write one entry at once. They write the same bytes, so each leaves what the other has
+    # put there, and removes only what no writer of this entry can have put. Keys are listed before their metadata is
+    # read: metadata is written first, so a key that was listed has metadata that can be read, unless it is broken.
+
+    def _open(self, ref: Ref, attributes: Mapping[str, Any]) -> zarr.Group:
+        """The entry's group, with these attributes when it was not there or says that it is made from something else.
+
+        Half a chunk of a killed run is removed: only a disk has such, and its lock is ours.
+        """
+        keys, group = self.keys_below(ref.path), self._group(ref.path)
+        if group is not None and _same_identity(group, ref):
+            for key in keys:
+                if key.endswith(".partial"):
+                    sync(self.backend.zarr.delete(key))
+            return group
+        if keys:
+            self.delete(ref.path)
+        try:
+            return zarr.create_group(self.backend.zarr, path=ref.path, attributes=dict(attributes))
+        except ContainsGroupError:
+            return zarr.open_group(self.backend.zarr, path=ref.path, mode="r+", zarr_format=3)
 
     def _arrays(self, ref: Ref, layouts: Mapping[str, Layout], rows: int) -> dict[str, zarr.Array]:
         """The entry's arrays: those of an interrupted run when they are of this layout, otherwise new ones.
@@ -201,16 +218,22 @@ class Store:
         A changed byte in what describes them must start them anew too: filled again as they stand, they would never
         count as complete.
         """
-        group = self._group(ref.path)
-        if group is not None and _same_header(group, ref):
-            for key in self.keys_below(ref.path):
-                if key.endswith(".partial"):  # half a chunk of a killed run; the lock is ours, nobody writes it
-                    sync(self.backend.zarr.delete(key))
-            found = {name: self._array(group, name) for name in layouts}
-            if all(_fits(found[name], layout, rows) for name, layout in layouts.items()):
-                return {name: array for name, array in found.items() if array is not None}
-        group = self._fresh(ref)
-        return {name: _create(group, name, layout, rows) for name, layout in layouts.items()}
+        group = self._open(ref, identity(ref))
+        return {name: self._array_of(group, name, layout, rows) for name, layout in layouts.items()}
+
+    def _array_of(self, group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Array:
+        path = f"{group.path}/{name}"
+        keys, found = self.keys_below(path), self._array(group, name)
+        if found is not None and _fits(found, layout, rows):
+            return found
+        if keys:
+            self.delete(path)
+        try:
+            return _create(group, name, layout, rows)
+        except ContainsArrayError:
+            made = self._array(group, name)
+            assert made is not None
+            return made
 
     def _rows_done(self, ref: Ref, arrays: Mapping[str, zarr.Array]) -> set[int]:
         """Rows whose chunks are present and pass their checksum in every array."""
@@ -370,20 +393,16 @@ def _create(group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Arr
     )
 
 
-def _header(ref: Ref) -> dict[str, Any]:
-    return {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
-
-
-def _same_header(group: zarr.Group, ref: Ref) -> bool:
-    header = _header(ref)
+def _same_identity(group: zarr.Group, ref: Ref) -> bool:
+    known = identity(ref)
     try:
-        return canonical({name: group.attrs.get(name) for name in header}) == canonical(header)
+        return canonical({name: group.attrs.get(name) for name in known}) == canonical(known)
     except ValueError:  # a changed byte made a number that is none
         return False
 
 
-def _fits(array: zarr.Array | None, layout: Layout, rows: int) -> bool:
-    if array is None or array.shape != (rows, *layout.row):
+def _fits(array: zarr.Array, layout: Layout, rows: int) -> bool:
+    if array.shape != (rows, *layout.row):
         return False
     ours = _create(zarr.open_group(MemoryStore(), mode="w"), "array", layout, rows)
     return metadata_digest(array) == metadata_digest(ours)

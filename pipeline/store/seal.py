@@ -20,8 +20,12 @@ def metadata_digest(array: zarr.Array) -> str:
     return digest(json.loads(json.dumps(array.metadata.to_dict(), default=str)))
 
 
-def finish(
-    group: zarr.Group,
+def identity(ref: Ref) -> dict[str, Any]:
+    """The attributes of an entry that is not complete yet: what it will be made from."""
+    return {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
+
+
+def finished(
     ref: Ref,
     arrays: Mapping[str, zarr.Array],
     document: Any,
@@ -29,8 +33,8 @@ def finish(
     rows: int,
     time_s: float,
     nbytes: int,
-) -> None:
-    """The one write that makes an entry count: document and completeness, in one atomic replacement."""
+) -> dict[str, Any]:
+    """All attributes of a complete entry. Written last and at once, they make it count."""
     record = {
         "rows": rows,
         "bytes": nbytes,
@@ -39,11 +43,8 @@ def finish(
         "arrays": {name: metadata_digest(array) for name, array in arrays.items()},
         "document": digest(document),
     }
-    attributes = {
-        "document": document,
-        "complete": record | {"seal": _seal(ref.key, json.loads(ref.made_from), record)},
-    }
-    group.attrs.update(attributes)
+    known = identity(ref)
+    return known | {"document": document, "complete": record | {"seal": _seal(ref.key, known["made_from"], record)}}
 
 
 def _seal(key: str, made_from: Any, record: Mapping[str, Any]) -> str:

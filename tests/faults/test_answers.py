@@ -10,7 +10,7 @@ from zarr.storage import LocalStore, WrapperStore
 from pipeline.errors import DzopError
 from pipeline.store import Layout, LocalStoreConfig, Store, make_ref
 from pipeline.store.admin import entries, verify
-from pipeline.store.answering import Answering
+from pipeline.store.answering import Answering, StoreUnreachable
 
 REF = make_ref("features/toy", {"kind": "toy", "version": 1}, {})
 DOCUMENT = make_ref("runs", {"kind": "toy run", "version": 1}, {})
@@ -99,7 +99,8 @@ def test_whatever_request_fails_it_is_told_and_the_next_run_heals_it(
         root = tmp_path / f"{at}"
         store = opened(root, Failing(LocalStore(root), FAULTS[name], at, lasting=lasting))
         with pytest.raises(
-            DzopError, match=r"s3://bucket/prefix: the store does not answer .*: what is complete is kept"
+            StoreUnreachable,
+            match=r"s3://bucket/prefix: (the store does not answer|access denied) .*: what is complete is kept",
         ):
             work(store)
         healthy = Store(LocalStoreConfig(root=str(root)))

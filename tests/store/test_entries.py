@@ -34,8 +34,10 @@ def fill(store: Store, log: list[list[int]] | None = None, refs=(REF,)):
     return store.fill(dict.fromkeys(refs, LAYOUT), rows=ROWS, batch=4, compute=lambda rows: compute(rows, log))
 
 
-@pytest.fixture(params=["local", "memory"])
+@pytest.fixture(params=["local", "memory", "s3"])
 def store(request, tmp_path: Path) -> Store:
+    if request.param == "s3":
+        return Store(request.getfixturevalue("s3").config())
     return Store(LocalStoreConfig(root=str(tmp_path / "cache")) if request.param == "local" else MemoryStoreConfig())
 
 
