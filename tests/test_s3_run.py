@@ -20,6 +20,7 @@ def scene(tmp_path_factory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_a_run_on_s3_leaves_the_bytes_of_a_local_run(scene, s3, tmp_path, capsys, monkeypatch):
     def run(name: str, *overrides: str):
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"out={tmp_path}/{name}")
