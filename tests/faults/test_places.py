@@ -49,8 +49,8 @@ def disk(tmp_path: Path):
 def test_a_full_disk_is_told_and_with_more_room_the_run_goes_on(
     ground: Ground, quiet: Undisturbed, disk: Disk, shares, record_property
 ):
-    whole, results = stored(quiet.after["evaluate"]), written(quiet.after["evaluate"], step="evaluate")
-    folder = quiet.copy(disk.at / "run", quiet.after["evaluate"])
+    whole, results = stored(quiet.alone), written(quiet.alone)
+    folder = quiet.copy(disk.at / "run", quiet.alone)
     needed = disk.used()
     for share in shares:
         shutil.rmtree(folder)
@@ -67,7 +67,7 @@ def test_a_full_disk_is_told_and_with_more_room_the_run_goes_on(
         again = ground.run(folder)
         assert again.status == 0, again.err
         assert stored(folder) == whole
-        assert written(folder, step="evaluate") == results
+        assert written(folder) == results
     record_property(
         "told",
         f"{len(shares)} disks full at {shares[0]:.0%} to {shares[-1]:.0%} of what a run takes: {len(shares)} healed",
@@ -78,11 +78,11 @@ def test_a_read_only_store_serves_what_it_has_and_names_what_it_lacks(
     ground: Ground, quiet: Undisturbed, disk: Disk, folder: Path
 ):
     folder.mkdir()
-    shutil.copytree(quiet.after["evaluate"] / "cache", disk.at / "cache")
+    shutil.copytree(quiet.alone / "cache", disk.at / "cache")
     disk.set("ro")
     ended = ground.run(folder, "evaluate", f"store.root={disk.at / 'cache'}")
     assert ended.status == 0, ended.err
-    assert written(folder, step="evaluate") == written(quiet.after["evaluate"], step="evaluate")
+    assert written(folder) == written(quiet.alone)
     disk.set("rw")
     shutil.rmtree(disk.at / "cache" / "features")
     (chunk,) = list((disk.at / "cache" / "crops").rglob("rgb/c/1/0/0/0"))[:1]
@@ -111,7 +111,7 @@ def test_results_that_cannot_be_written_are_told_before_anything_is_computed(gro
 @pytest.mark.parametrize("year", [1971, 2106])
 def test_a_clock_that_was_wrong_changes_nothing(ground: Ground, quiet: Undisturbed, folder: Path, year: int):
     """Files, locks and records of another year: what is whole counts, what is not is made again."""
-    quiet.copy(folder, quiet.after["evaluate"])
+    quiet.copy(folder, quiet.alone)
     shutil.rmtree(folder / "cache" / "poses")
     shutil.rmtree(folder / "cache" / "runs")
     (chunk, *_) = list((folder / "cache" / "crops").rglob("rgb/c/1/0/0/0"))
@@ -125,7 +125,7 @@ def test_a_clock_that_was_wrong_changes_nothing(ground: Ground, quiet: Undisturb
             break
         assert "run again" in ended.err
     assert ended.status == 0, ended.err
-    assert written(folder, step="evaluate") == written(quiet.after["evaluate"], step="evaluate")
+    assert written(folder) == written(quiet.alone)
 
 
 def test_entries_completed_in_the_future_are_not_old(quiet: Undisturbed, folder: Path, monkeypatch):

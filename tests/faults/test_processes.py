@@ -16,7 +16,7 @@ def test_processes_on_one_cold_cache_end_with_the_bytes_of_one(
     ground: Ground, quiet: Undisturbed, folder: Path, count, lost, record_property
 ):
     folder.mkdir()
-    results = written(quiet.after["evaluate"], step="evaluate")
+    results = written(quiet.alone)
     names = [f"process{n}" for n in range(count)]
     processes = [ground.start(folder, "evaluate", f"out=out-{name}", name=name) for name in names]
     rng = random.Random(count)
@@ -27,8 +27,8 @@ def test_processes_on_one_cold_cache_end_with_the_bytes_of_one(
     for process, name in list(zip(processes, names, strict=True))[lost:]:
         ended = ground.end(process, folder, name=name)
         assert ended.status == 0, ended.err
-        assert written(folder, f"out-{name}", step="evaluate") == results
-    assert stored(folder) == stored(quiet.after["evaluate"])
+        assert written(folder, f"out-{name}") == results
+    assert stored(folder) == stored(quiet.alone)
     record_property(
         "told", f"{count} processes on one cold cache, {lost} of them killed: {count - lost} ended as one undisturbed"
     )

@@ -38,7 +38,7 @@ PICTURES = [
 ]
 
 
-@fuzzed(200)
+@fuzzed(100)
 @given(data=st.data())
 def test_an_image_is_read_or_refused_in_one_line(tmp_path_factory, data):
     content = bytearray(data.draw(st.sampled_from(PICTURES)))
@@ -114,7 +114,7 @@ def test_a_program_is_no_image_and_is_not_run(tmp_path: Path, monkeypatch):
 RUNS = st.lists(st.integers(-2, 60) | st.sampled_from([2**31, 2**63, 10**30, 0.5, None, True, "1"]), max_size=12)
 
 
-@fuzzed(300)
+@fuzzed(120)
 @given(
     size=st.sampled_from([[12, 9], [9, 12], [12.0, 9.0], [0, 0], [2**31, 2**31], "12", None]),
     counts=RUNS

@@ -97,7 +97,7 @@ def broken(draw, text: str) -> bytes:
     return bytes(data[: draw(st.integers(0, len(data)))] if draw(st.integers(0, 9)) == 0 else data)
 
 
-@fuzzed(150)
+@fuzzed(80)
 @given(data=st.data())
 def test_a_dataset_is_read_or_refused_in_one_line(root: Path, data):
     path = root / FILES[data.draw(st.sampled_from(sorted(FILES)))]

@@ -58,7 +58,7 @@ def whole(folder: Path) -> dict[str, bytes]:
 NUMBERS = ["-1", "0", "3", "255", "4294967295", "99999999999999999999", "1e400", "nan", "-inf", "", "\0", "²", "é"]
 
 
-@fuzzed(300)
+@fuzzed(120)
 @given(data=st.data())
 def test_a_mesh_is_read_or_refused_in_one_line(folder: Path, whole, data):
     name = data.draw(st.sampled_from(sorted(whole)))

@@ -150,7 +150,7 @@ WORDS += [
 ]
 
 
-@fuzzed(8)
+@fuzzed(5)
 @given(
     overrides=st.lists(
         st.tuples(st.sampled_from(KEYS), st.sampled_from(WORDS) | st.text(max_size=6)).map("=".join),
