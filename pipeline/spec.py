@@ -139,8 +139,8 @@ class Runtime:
 
     device: str = "auto"
     batch: NonNegative = 0
-    max_vram: str | int | None = None
-    max_memory: str | int | None = None
+    max_vram: Any = None  # what is no size is refused where it is read
+    max_memory: Any = None
     progress: bool = True
 
     @property

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +97,14 @@ class Scene:
 
     def ground_truth(self, im_id: int) -> list[GroundTruth]:
         """Annotated instances of one image. Raises BadInput when there is no annotation or a pose is impossible."""
-        return list(self._ground_truth(im_id))
+        if im_id not in self._ground_truth:
+            self._ground_truth[im_id] = self._parsed(im_id)
+        return list(self._ground_truth[im_id])
 
     @cached_property
-    def _ground_truth(self) -> Callable[[int], list[GroundTruth]]:
-        """Parsed once: every step asks for it again."""
-        return lru_cache(maxsize=None)(self._parsed)
+    def _ground_truth(self) -> dict[int, list[GroundTruth]]:
+        """By image, parsed once: every step asks for it again. A dict, as a scene travels to workers."""
+        return {}
 
     def _parsed(self, im_id: int) -> list[GroundTruth]:
         path = self.folder / "scene_gt.json"
