@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from pipeline.functional.rigid import transform
 from pipeline.items.objects import Mesh
 from pipeline.items.views import Image
 from pipeline.stages.render.raycast import render_depth
+from pipeline.whole import write_whole
 
 Role = Literal["truth", "correct", "wrong", "unchecked"]
 Colour = tuple[int, int, int]
@@ -77,13 +78,9 @@ def draw_overlay(image: Image, items: Sequence[Drawn], *, legend: bool = True) -
 
 def write_overlay(path: Path, picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 90) -> None:
     """Write a picture as its suffix says (.jpg, .png); a reader sees the whole file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
-        PIL.Image.fromarray(picture).save(partial, quality=quality)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    stream = io.BytesIO()
+    PIL.Image.fromarray(picture).save(stream, PIL.Image.registered_extensions()[path.suffix], quality=quality)
+    write_whole(path, stream.getvalue())
 
 
 def clip_to_front(segments_cam: Float[np.ndarray, "e 2 3"], *, near_mm: float = _NEAR_MM) -> Float[np.ndarray, "k 2 3"]:

@@ -108,7 +108,7 @@ def read_row(path: Path) -> Row:
         if record.pop("format") != FORMAT:
             raise BadInput(path, found="a row of another version", needed=f"format {FORMAT}: run it again")
         return _row(record)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         found = f"{type(error).__name__}: {error}"
         raise BadInput(path, found=found, needed="a row that a run has written; remove the file") from None
 

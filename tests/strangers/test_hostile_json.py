@@ -145,6 +145,12 @@ def test_rows_of_reports_are_read_or_refused_in_one_line(tmp_path_factory, data)
     outcome(lambda: read_rows(folder.parent))
 
 
+def test_a_row_nested_too_deeply_is_refused(tmp_path: Path):
+    (tmp_path / "rows").mkdir()
+    (tmp_path / "rows" / "a.json").write_bytes(b"[" * 100_000)
+    assert "a.json: found RecursionError" in outcome(lambda: read_rows(tmp_path))
+
+
 HOSTILE = {
     "deep lists": (b"[" * 100_000, "nested too deeply"),
     "deep objects": (b'{"a":' * 100_000, "nested too deeply"),
