@@ -60,9 +60,19 @@ class TwoNodes:
 @pytest.fixture
 def nodes() -> Iterator[TwoNodes]:
     utils = pytest.importorskip("ray.cluster_utils", reason="needs Ray: pip install 'dzop[ray]'")
-    started = TwoNodes(utils.Cluster)
+    started = _start(utils.Cluster)
     yield started
     started.cluster.shutdown()
+
+
+def _start(cluster_type: type) -> TwoNodes:
+    """Ray gives a node 30 s to start, which a machine that is busy with other tests may not keep."""
+    for _ in range(3):
+        try:
+            return TwoNodes(cluster_type)
+        except Exception as error:
+            late = error
+    raise late
 
 
 @pytest.mark.slow
