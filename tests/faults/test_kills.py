@@ -2,6 +2,7 @@
 
 import random
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -17,20 +18,22 @@ def test_a_killed_step_is_healed_by_the_next_run(
     rng = random.Random(f"{step} {kills}")
     whole, results = stored(quiet.after[step]), written(quiet.after[step])
     killed = healed = late = 0
+    lasts = quiet.seconds[step]
     while killed < kills:
         quiet.copy(folder, quiet.before(step))
-        for _ in range(
-            min(kills - killed, rng.choice([1, 1, 1, 2, 3]))
-        ):  # some are killed again before they are healed
+        in_a_row = rng.choice([1, 1, 1, 2, 3])  # some are killed again before they are healed
+        for _ in range(min(kills - killed, in_a_row)):
             process = ground.start(folder, step)
-            process.join(rng.uniform(0, 0.9 * quiet.seconds[step]))
+            process.join(rng.uniform(0, 0.9 * lasts))
             late += process.exitcode is not None
             killed += process.exitcode is None
             process.kill()
             process.join()
             left = stored(folder)
             assert all(whole[name] == value for name, value in left.items())
+        start = time.monotonic()
         ended = ground.run(folder, step)
+        lasts = 0.5 * (lasts + time.monotonic() - start)  # as long as the machine takes now
         assert ended.status == 0, ended.err
         assert stored(folder) == whole
         assert written(folder) == results
