@@ -6,7 +6,6 @@ import contextlib
 import io
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -17,7 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from benchmarks.measure import Figure, interleaved
+from benchmarks.measure import Figure, interleaved, peak_bytes
 from pipeline.__main__ import CONF, options_of, stages_of, variant
 from pipeline.run import run
 from pipeline.store import Store
@@ -110,7 +109,7 @@ def _estimate(folder: str, objects: str, device: str, per_cluster: str) -> None:
         job(Path(folder), *size, "extract=pixels", "render.count=2", "step=detect")  # makes the data set
     job(Path(folder), *size, *chosen, f"correspond.per_cluster={per_cluster}")
     (Path(folder) / "done").touch()
-    print(json.dumps({"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+    print(json.dumps({"peak_mb": peak_bytes() / 2**20}))
 
 
 if __name__ == "__main__":

@@ -41,6 +41,8 @@ from pipeline.stages.render import Renderer
 from pipeline.stages.solve import Solver
 
 MIN_POINTS = 4
+ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "refine")
+"""What a pose depends on beside the features."""
 
 
 @dataclass(frozen=True)

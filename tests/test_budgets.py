@@ -133,14 +133,14 @@ def test_a_batch_is_sized_to_the_budget():
 
 
 PEAK = """
-import re, sys
+import sys
 import psutil, pipeline.__main__ as command, pipeline.stages.extract.hog
+from benchmarks.measure import peak_bytes
 room, *arguments = sys.argv[1:]
 budget = psutil.Process().memory_info().rss + int(room)
 sys.argv = ["dzop", *arguments, f"runtime.max_memory={budget // 1000}kB"]
 command.main()
-peak = re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())  # ru_maxrss would hold the parent's
-print("budget", budget, "peak", int(peak[1]) * 1024)
+print("budget", budget, "peak", peak_bytes())
 """
 
 

@@ -16,12 +16,11 @@ from pipeline.graph.work import Advance, Work
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_of, record_of
 from pipeline.items.views import Detection, Target
-from pipeline.route import Query, Trace, Truth, template_pose, trace_pose
+from pipeline.route import ONLINE_STAGES, Query, Trace, Truth, template_pose, trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
 POSES_VERSION = 2
-ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "refine")
 
 
 @dataclass(eq=False)

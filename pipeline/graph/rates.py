@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from pipeline.route import Stages
+from pipeline.route import ONLINE_STAGES, Stages
 from pipeline.spec import digest
 from pipeline.whole import write_json
 
@@ -80,6 +80,5 @@ def work_of(step: str, stages: Stages, layers: Sequence[int] = (), rows: int = 0
     if step == "fits":
         return digest([step, stages.extract.recipe(), [fit.recipe() for fit in stages.fits], stages.render.recipe()])
     if step == "poses":
-        online = (stages.match, stages.fuse, stages.cluster, stages.correspond, stages.solve, stages.refine)
-        return digest([step, stages.extract.recipe(), [stage.recipe() for stage in online], rows])
+        return digest([step, stages.extract.recipe(), [getattr(stages, name).recipe() for name in ONLINE_STAGES], rows])
     return digest([step, (stages.render if step == "templates" else stages.crop).recipe()])

@@ -270,8 +270,9 @@ def test_a_layer_timestep_or_size_the_model_does_not_have_is_named(sd1: Path) ->
 
 
 _SUBPROCESS = """
-import resource, sys
+import sys
 import numpy as np
+from benchmarks.measure import peak_bytes
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
@@ -285,7 +286,7 @@ maps = backbone(crops, [2, 5, 8, 11])
 assert all(tuple(v.shape) == (12, *spec.feature_shape(k)) for k, v in maps.items())
 assert [spec.feature_shape(k) for k in maps] == [(1280, 4, 4), (1280, 8, 8), (640, 16, 16), (320, 32, 32)]
 assert all(bool(np.isfinite(v.numpy()).all()) for v in maps.values())
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print(peak_bytes())
 """
 
 
@@ -300,5 +301,5 @@ def test_full_size_sd15_in_float32_stays_under_6_gigabytes(tmp_path: Path) -> No
         for path in root.rglob("*.safetensors"):
             path.unlink()  # 2 GB that pytest would keep for three runs
     assert done.returncode == 0, done.stderr
-    peak_bytes = int(done.stdout.split()[-1]) * 1024
+    peak_bytes = int(done.stdout.split()[-1])
     assert peak_bytes < 6e9
