@@ -17,9 +17,10 @@ from pipeline.report.rows import Row, read_rows
 
 TEST_SEED = 9041  # of synthetic.demo; training and validation objects have builders and seeds of their own
 DEMO = ("dataset=demo", f"dataset.seed={TEST_SEED}", "dataset.objects=20", "dataset.images=40", "dataset.per_image=5")
-OURS = "embedded, learned"
+OURS = "embedded, learned and edges"
 SYSTEMS = {
     OURS: ("extract=embedded",),
+    "embedded, learned alone": ("extract=embedded", "fuse=learned", "fuse.layers=[2,5,8,11]"),
     "embedded, pure": ("extract=embedded", "extract.weights=pure"),
     "random weights": ("extract=random_sd", "extract.noise=none"),
     "pixels": ("extract=pixels",),

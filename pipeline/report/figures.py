@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -136,7 +137,7 @@ def _objects_figure(rows: Mapping[str, Row], dataset: str, objects: Sequence[int
         scores = _scores(row)
         spread = [ar_interval(scores.of(scores.obj_id == obj_id)) for obj_id in objects]
         place = np.arange(len(objects)) + (k - (bars - 1) / 2) * width
-        axes.bar(place, [i.mean for i in spread], width * 0.92, color=COLOURS[k % len(COLOURS)], label=name)
+        axes.bar(place, [i.mean for i in spread], width * 0.92, color=COLOURS[k % len(COLOURS)], label=_wrapped(name))
         axes.errorbar(place, [i.mean for i in spread], _whiskers(spread), fmt="none", ecolor="#40464f", elinewidth=0.8)
     for k, (name, values) in enumerate(theirs.items(), start=len(rows)):
         place = np.arange(len(objects)) + (k - (bars - 1) / 2) * width
@@ -158,7 +159,7 @@ def theta_figure(rows: Mapping[str, Row], dataset: str) -> Figure:
     for k, (name, row) in enumerate(rows.items()):
         spread = [ar_interval(_scores(row), theta_max=float(bound)) for bound in THETAS]
         colour = COLOURS[k % len(COLOURS)]
-        axes.plot(THETAS, [i.mean for i in spread], "o-", color=colour, label=name)
+        axes.plot(THETAS, [i.mean for i in spread], "o-", color=colour, label=_wrapped(name))
         axes.fill_between(THETAS, [i.low for i in spread], [i.high for i in spread], color=colour, alpha=0.14, lw=0)
     axes.set(ylabel=_short(_scores(next(iter(rows.values())))), ylim=(0, None))
     _legend(axes)
@@ -243,7 +244,7 @@ def times_figure(rows: Mapping[str, Row]) -> Figure:
         seconds = np.array([row.times_s.get(stage, 0.0) for row in rows.values()])
         axes.barh(range(len(rows)), seconds, left=left, color=colour, height=0.66, label=stage)
         left += seconds
-    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_yticks(range(len(rows)), [_wrapped(name) for name in rows])
     axes.invert_yaxis()
     axes.set(xlabel="median seconds of a target")
     axes.grid(axis="y", visible=False)
@@ -256,6 +257,12 @@ def value_text(value: Any) -> str:
     if isinstance(value, tuple):
         return ", ".join(map(str, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _wrapped(name: str) -> str:
+    """A run's name in lines that leave the axes their room; a page's tables have it whole."""
+    lines = textwrap.wrap(name, 26)
+    return "\n".join(lines if len(lines) <= 3 else [*lines[:2], f"{lines[2]} ..."])
 
 
 def _scores(row: Row) -> Scores:

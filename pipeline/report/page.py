@@ -134,10 +134,11 @@ class Section:
     def figures(self) -> dict[str, list[Figure]]:
         """Figures by the part of the page they stand in."""
         shown = dict(self.methods)
-        if self.best.id != self.base.id:
-            shown.setdefault(f"{self.name(self.best)} (best)", self.best)
+        named = {row.id: method for method, row in self.methods}
+        if self.best.id not in named:
+            shown[f"{self.name(self.best)} (best)"] = self.best
         visible = figures.visibility_figure(self.base)
-        timed = {self.name(row): row for row in self.rows if row.times_s and self._timed(row)}
+        timed = {named.get(row.id, self.name(row)): row for row in self.rows if row.times_s and self._timed(row)}
         return {
             "recalls": [
                 *figures.objects_figures(shown, self.dataset),

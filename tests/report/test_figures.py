@@ -1,3 +1,4 @@
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -62,3 +63,13 @@ def test_a_figure_is_real_text_and_the_same_every_time():
     assert first == second
     assert ">published, LM-O<" in first.replace("</tspan>", "")
     assert "<metadata>" not in first
+
+
+def test_names_of_any_length_leave_the_axes_their_room():
+    long = "match.layer=8, " * 12 + "solve._target_=pipeline.stages.solve.poselib.PoseLib"
+    rows = {long: toy_row(), long + " too": toy_row(0.3)}
+    drawn = figures.times_figure(rows), figures.theta_figure(rows, "demo"), *figures.objects_figures(rows, "demo")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # matplotlib gives up its layout with a warning
+        for figure in drawn:
+            figure.canvas.draw_without_rendering()

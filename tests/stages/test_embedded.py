@@ -11,12 +11,14 @@ from pipeline.errors import BadInput
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
-from pipeline.stages.extract.embedded import Embedded
+from pipeline.stages.extract.embedded import EDGES, Embedded
+from pipeline.stages.extract.fitting import maps_bytes
 from pipeline.stages.fuse.auto import Auto
 from pipeline.stages.fuse.learned import Learned
 from pipeline.stages.fuse.pca import Pca
 
 LAYERS = (2, 5, 8, 11)
+ALL = (*LAYERS, EDGES)
 
 
 def crops(count: int) -> Crops:
@@ -27,12 +29,29 @@ def crops(count: int) -> Crops:
 @pytest.mark.parametrize("weights", ["learned", "pure"])
 def test_features_come_from_the_package(weights):
     extract = Embedded(weights=weights)
-    maps = extract.load(Runtime(device="cpu"))(crops(2), LAYERS)
-    for layer in LAYERS:
+    maps = extract.load(Runtime(device="cpu"))(crops(2), ALL)
+    for layer in ALL:
         assert maps[layer].shape[1:] == extract.feature_shape(layer)
         assert torch.isfinite(maps[layer]).all()
     assert extract.model.startswith(f"embedded-{weights}-")
     assert "not Stable Diffusion's" in extract.notice
+
+
+def test_edges_are_the_same_in_any_batch_and_stay_while_the_weights_change():
+    many = crops(5)
+    whole = Embedded().load(Runtime(device="cpu", batch=2))(many, [EDGES])[EDGES]
+    assert whole.shape == (5, 8, 64, 64)
+    for k in range(5):
+        assert torch.equal(
+            Embedded(weights="pure").load(Runtime(device="cpu"))(many[k : k + 1], ALL)[EDGES][0], whole[k]
+        )
+    assert Embedded(input_size=256).feature_shape(EDGES) == (8, 128, 128)
+
+
+def test_edges_count_in_the_footprint():
+    with_edges, without = (Embedded().footprint(layers, 128) for layers in (ALL, LAYERS))
+    assert with_edges.a_crop - without.a_crop == maps_bytes([(8, 64, 64)])
+    assert with_edges.weights == without.weights
 
 
 def test_the_two_sets_of_weights_have_keys_of_their_own():
@@ -61,19 +80,34 @@ def test_missing_weights_say_how_to_make_them(tmp_path, monkeypatch):
 
 
 def test_the_head_fuses_both_sides_alike_at_twice_the_finest_layers_cells():
-    maps = Embedded().load(Runtime(device="cpu"))(crops(1), LAYERS)
+    maps = Embedded().load(Runtime(device="cpu"))(crops(1), ALL)
     one = {layer: m[0] for layer, m in maps.items()}
     mask = torch.ones(128, 128, dtype=torch.bool)
-    pair = Learned()(one, one, mask, mask)
-    torch.testing.assert_close(pair.query, pair.template)
-    assert pair.query.shape[-1] == 2 * one[11].shape[-1]
+    for fuse in (Learned(), Learned(layers=LAYERS)):
+        pair = fuse(one, one, mask, mask)
+        torch.testing.assert_close(pair.query, pair.template)
+        assert pair.query.shape[-1] == 2 * one[11].shape[-1]
+
+
+def test_descriptors_and_edges_share_a_cosine_by_the_square_of_their_weight():
+    maps = Embedded().load(Runtime(device="cpu"))(crops(2), ALL)
+    sides = [{layer: m[k] for layer, m in maps.items()} for k in (0, 1)]
+    mask = torch.ones(128, 128, dtype=torch.bool)
+
+    def inner(fuse: Learned) -> torch.Tensor:
+        pair = fuse(*sides, mask, mask)
+        return (pair.query * pair.template).sum(0)
+
+    alone = Learned(layers=LAYERS)(*sides, mask, mask)
+    cosine = torch.cosine_similarity(alone.query, alone.template, dim=0)
+    torch.testing.assert_close(inner(Learned(edges=2.0)) - cosine, 4 * (inner(Learned(edges=1.0)) - cosine))
 
 
 def test_the_head_refuses_features_it_was_not_trained_on():
     Learned().check(Embedded().model)
     with pytest.raises(BadInput, match=r"features of embedded-pure-.* needs extract=embedded extract.weights=learned"):
         Learned().check(Embedded(weights="pure").model)
-    with pytest.raises(BadInput, match=r"fuse.layers: found \[2, 5\], needs \[2, 5, 8, 11\]"):
+    with pytest.raises(BadInput, match=r"fuse.layers: found \[2, 5\], needs \[2, 5, 8, 11, 12\]"):
         Learned(layers=(2, 5)).check(Embedded().model)
 
 

@@ -6,9 +6,10 @@ import torch
 
 from pipeline.errors import BadInput
 from pipeline.functional.camera import cell_to_px
+from pipeline.functional.gradients import oriented_energy
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
-from pipeline.stages.extract.hog import Hog, oriented_energy
+from pipeline.stages.extract.hog import Hog
 
 CPU = Runtime(device="cpu")
 LAYERS = (2, 5, 8, 11)

@@ -1,24 +1,36 @@
-"""crops -> feature maps of the small latent diffusion model that ships with the package. No download, no network."""
+"""crops -> feature maps of the small latent diffusion model that ships with the package. No download, no network.
+
+Past the decoder's layers 0 to 11 there is one more, 12: the crop's own gradient histograms, for what 4 px a cell lose.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from pipeline.digests import file_digest
 from pipeline.errors import BadInput
-from pipeline.spec import Positive, digest, spec
-from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.functional.gradients import ORIENTATIONS, edge_histograms
+from pipeline.items.features import FeatureMaps
+from pipeline.items.views import Crops
+from pipeline.spec import Positive, Runtime, digest, spec
+from pipeline.stages.extract.diffusion import Architecture, DiffusionBackbone, DiffusionFeatures, LoadedModel
+from pipeline.stages.extract.fitting import Footprint, maps_bytes
 from pipeline.stages.extract.loading import empty_model, without_decoder
 from pipeline.stages.extract.noise import NoiseMode
 from pipeline.stages.extract.weights import alphas_cumprod
 
 FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
+EDGES = 12  # the layer past the decoder's
 PROMPT = (1, 1, 32)  # of zeros: the model knows no text
 
 WeightSet = Literal["learned", "pure"]
@@ -48,6 +60,23 @@ class Embedded(DiffusionFeatures):
         """``embedded-pure-`` or ``embedded-learned-`` and 8 digits of the digest of the weights."""
         return f"embedded-{self.weights}-{self._digest()[:8]}"
 
+    def feature_shape(self, layer: int) -> tuple[int, int, int]:
+        """As DiffusionFeatures.feature_shape; layer 12 has two cells a side for each of the latent's."""
+        if layer != EDGES:
+            return super().feature_shape(layer)
+        cells = 2 * self.input_size // self.architecture().vae_factor
+        return ORIENTATIONS, cells, cells
+
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
+        """As DiffusionFeatures.footprint; edges are made after the passes, in less than these take."""
+        most = super().footprint(_decoder(layers), crop_size, device)
+        edges = [self.feature_shape(layer) for layer in layers if layer == EDGES]
+        return replace(most, a_crop=most.a_crop + maps_bytes(edges))
+
+    def load(self, runtime: Runtime) -> EmbeddedBackbone:
+        """As DiffusionFeatures.load."""
+        return EmbeddedBackbone(self, super().load(runtime))
+
     def recipe(self) -> dict[str, Any]:
         """As DiffusionFeatures.recipe, with the digest of the weights behind the name of the set."""
         return super().recipe() | {"weights": f"{self.weights} {self._digest()}"}
@@ -69,6 +98,31 @@ class Embedded(DiffusionFeatures):
     def _digest(self) -> str:
         files = [FOLDER / name for name in ("config.json", f"unet_{self.weights}.safetensors", "vae.safetensors")]
         return digest([_digest_of(path) for path in files])
+
+
+class EmbeddedBackbone:
+    """The model in memory, and edges."""
+
+    def __init__(self, spec: Embedded, decoder: DiffusionBackbone) -> None:
+        self.spec, self.decoder, self.batch = spec, decoder, decoder.batch
+
+    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of the given layers, in the spec's dtype, on the model's device."""
+        maps = self.decoder(crops, _decoder(layers)) if _decoder(layers) else {}
+        if EDGES in layers:
+            chunks = [self._edges(crops[i : i + self.batch]) for i in range(0, len(crops), self.batch)]
+            maps = {**maps, EDGES: torch.cat(chunks)}
+        return maps
+
+    def _edges(self, crops: Crops) -> Float[Tensor, "n 8 h w"]:
+        device = self.decoder.model.prompt.device
+        rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (crops.rgb, crops.mask))
+        edges = edge_histograms(rgb, mask, cells=self.spec.feature_shape(EDGES)[1])
+        return edges.to(getattr(torch, self.spec.dtype))
+
+
+def _decoder(layers: Sequence[int]) -> list[int]:
+    return [layer for layer in layers if layer != EDGES]
 
 
 @lru_cache(maxsize=1)

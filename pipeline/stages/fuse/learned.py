@@ -1,4 +1,4 @@
-"""query and template features -> one map each, by the head that was trained with the embedded model."""
+"""query and template features -> one map each, by the head trained with the embedded model and the crops' edges."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from torch import Tensor
 from pipeline.digests import file_digest
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
+from pipeline.functional.gradients import with_edges
 from pipeline.items.features import FusedPair
-from pipeline.spec import Spec, spec
+from pipeline.spec import PositiveFloat, Spec, spec
+from pipeline.stages.extract.embedded import EDGES
 from pipeline.stages.fuse import Layers, fused
 
 LAYERS = (2, 5, 8, 11)
+WITH_EDGES = (*LAYERS, EDGES)
 HEAD = Path(__file__).parents[2] / "embedded" / "weights" / "head.safetensors"
 
 
@@ -26,13 +29,16 @@ HEAD = Path(__file__).parents[2] / "embedded" / "weights" / "head.safetensors"
 class Learned(Spec):
     """Descriptors of a trained aggregation of all layers (after Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023).
 
-    Goes with ``extract=embedded extract.weights=learned``, whose features it was trained on, and with no other.
+    Layer 12, the crop's own gradient histograms, stands beside them with the weight ``edges``: the descriptors tell
+    places apart, edges say where exactly. Without 12 among the ``layers``, descriptors are alone. Goes with
+    ``extract=embedded extract.weights=learned``, whose features it was trained on, and with no other.
     """
 
     kind: ClassVar[str] = "fuse.learned"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
-    layers: Layers = LAYERS
+    layers: Layers = WITH_EDGES
+    edges: PositiveFloat = 1.5
 
     @staticmethod
     def suits(model: str) -> bool:
@@ -44,8 +50,9 @@ class Learned(Spec):
         if not self.suits(model):
             needed = "extract=embedded extract.weights=learned, or fuse=auto or pca for other features"
             raise BadInput("fuse=learned", found=f"features of {model}", needed=needed)
-        if self.layers != LAYERS:
-            raise BadInput("fuse.layers", found=list(self.layers), needed=f"{list(LAYERS)} for fuse=learned")
+        if self.layers not in (LAYERS, WITH_EDGES):
+            needed = f"{list(WITH_EDGES)} for fuse=learned, or {list(LAYERS)} without edges"
+            raise BadInput("fuse.layers", found=list(self.layers), needed=needed)
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the digest of the head's weights."""
@@ -63,6 +70,8 @@ class Learned(Spec):
         with torch.no_grad():
             maps = {layer: torch.stack([query[layer], template[layer]]).float() for layer in self.layers}
             pair = head(maps)
+            if EDGES in maps:
+                pair = with_edges(pair, maps[EDGES], weight=self.edges)
         return fused(pair[0], pair[1], query_mask, template_mask)
 
 
