@@ -58,7 +58,7 @@ class Plan:
     shards: int = 150
     autoencoder: int = 500
     denoiser: int = 400
-    descriptors: int = 8000
+    descriptors: int = 7400
     easy: int = 2700
     faithful: int = 5300
     seed: int = 0

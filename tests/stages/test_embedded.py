@@ -113,5 +113,7 @@ def test_the_head_refuses_features_it_was_not_trained_on():
 
 def test_auto_takes_the_head_where_the_features_have_one():
     assert Auto().resolve_for(Embedded().model) == Learned()
+    with pytest.raises(BadInput, match=r"fuse.layers: found \[5, 8\]"):
+        Auto(layers=(5, 8)).resolve_for(Embedded().model).check(Embedded().model)
     assert Auto(layers=(5, 8)).resolve_for(Embedded(weights="pure").model) == Pca(layers=(5, 8))
     assert Auto().resolve_for("hog") == Pca()

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from pipeline.spec import Spec, spec
-from pipeline.stages.extract.embedded import EDGES
 from pipeline.stages.fuse import Layers
-from pipeline.stages.fuse.learned import Learned
+from pipeline.stages.fuse.learned import LAYERS, Learned
 from pipeline.stages.fuse.pca import Pca
 
 
@@ -21,8 +20,10 @@ class Auto(Spec):
     kind: ClassVar[str] = "fuse.auto"
     version: ClassVar[int] = 1
 
-    layers: Layers = (2, 5, 8, 11)
+    layers: Layers = LAYERS
 
     def resolve_for(self, model: str) -> Learned | Pca:
         """The variant for features of an extractor's ``model``."""
-        return Learned(layers=(*self.layers, EDGES)) if Learned.suits(model) else Pca(layers=self.layers)
+        if not Learned.suits(model):
+            return Pca(layers=self.layers)
+        return Learned() if self.layers == LAYERS else Learned(layers=self.layers)  # which its check refuses by name
