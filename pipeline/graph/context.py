@@ -53,7 +53,7 @@ class Context:
         return sorted({(target.scene_id, target.im_id) for target in self.targets})
 
     @cached_property
-    def model(self) -> Callable[[int], ObjectModel]:
+    def model(self) -> Kept[int, ObjectModel]:
         """An object's mesh; the last ones stay in memory, so that it does not grow with the number of objects."""
         return Kept(self._model, _mesh_bytes, MESHES_BYTES)
 

@@ -211,6 +211,7 @@ class TemplateNodes:
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
+        self.run.model.forget(obj_id)  # and with the mesh what the renderer made of it, three times as large
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.run.stages.layers)
         self.make_fitted(obj_id)
