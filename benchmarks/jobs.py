@@ -21,7 +21,7 @@ from pipeline.__main__ import CONF, options_of, stages_of, variant
 from pipeline.run import run
 from pipeline.store import Store
 
-SMALL = ("dataset=demo", "dataset.objects=6", "dataset.images=8", "dataset.per_image=3", "evaluate.vsd=false")
+SMALL = ("dataset=demo", "dataset.objects=15", "dataset.images=8", "dataset.per_image=3", "evaluate.vsd=false")
 QUIET = ("overlays=false", "gallery=0", "runtime.progress=false")
 FEW, MANY = 2, 6
 
@@ -53,7 +53,7 @@ def warm(*, device: str, repeats: int) -> list[Figure]:
             {"job": lambda: job(folder, *chosen), "estimate": lambda: job(folder, *chosen, "step=estimate")},
             repeats=repeats,
         )
-    sized = "6 objects, 8 images, 24 targets"
+    sized = "15 objects, 8 images, 24 targets"
     return [
         Figure(f"warm job, step=all, {sized}", took["job"].cpu_s, "s of one core", "", 0.3),
         Figure(f"warm job, step=estimate, {sized}", took["estimate"].cpu_s, "s of one core", "", 0.3),

@@ -35,6 +35,7 @@ _MAX_TEXTURE_PX = 16384
 _MAX_NAME = 255
 _MAX_FACES = 20_000_000
 _MAX_UNSTORED = 1_000_000  # elements of a glTF accessor that no buffer holds: they cost the file nothing
+_READABLE = "a readable mesh file"
 _GUTTER = 8  # texels around a texture in an atlas: enough for a minification by 8
 
 
@@ -45,14 +46,31 @@ def read_mesh(path: Path) -> Mesh:
     last. Other formats keep the vertices that faces use, copies beside them. Raises BadInput for a file or companion
     that is missing or broken, and for a mesh without an extent.
     """
+    path = _mesh_file(path)
+    companions = _Companions(path)
+    mesh = _checked(path, _load(path, companions))
+    return replace(mesh, digest=companions.digest())
+
+
+def mesh_digest(path: Path) -> str:
+    """``read_mesh(path).digest``, from the header alone where the format is ply. Raises BadInput as that does."""
+    path = _mesh_file(path)
+    if path.suffix.lower() != ".ply":
+        return read_mesh(path).digest  # which files belong to it is known once it has been read
+    companions = _Companions(path)
+    name = _texture_name(_ply_head(path, read_file(path, _READABLE)))
+    if name is not None:
+        companions.read(name)
+    return companions.digest()
+
+
+def _mesh_file(path: Path) -> Path:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise BadInput(path, found=f"suffix {path.suffix!r}", needed=f"a mesh: {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise BadInput(path, found="no such file", needed="a mesh file")
-    companions = _Companions(path)
-    mesh = _checked(path, _load(path, companions))
-    return replace(mesh, digest=files_digest({path.name: path} | companions.opened))
+    return path
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
@@ -103,18 +121,27 @@ class _Companions:
     def get(self, name: str) -> bytes:
         """Bytes of the file ``name``. Raises BadInput, and keeps it."""
         try:
-            relative = self._inside(name)
-            path = self.mesh_path.parent / relative
-            data = read_file(path, f"the file named in {self.mesh_path.name}")
+            path, data = self.read(name)
             if path.suffix.lower() in _PICTURES:
                 _picture(path, data)
         except BadInput as error:
             self.failure = self.failure or error
             raise
-        self.opened[relative.as_posix()] = path
         return data
 
     __getitem__ = get
+
+    def read(self, name: str) -> tuple[Path, bytes]:
+        """Path and bytes of the file ``name``, whatever it holds; it is remembered. Raises BadInput."""
+        relative = self._inside(name)
+        path = self.mesh_path.parent / relative
+        data = read_file(path, f"the file named in {self.mesh_path.name}")
+        self.opened[relative.as_posix()] = path
+        return path, data
+
+    def digest(self) -> str:
+        """Of the mesh file and all that was opened beside it."""
+        return files_digest({self.mesh_path.name: self.mesh_path} | self.opened)
 
     def _inside(self, name: str) -> PurePosixPath:
         relative = PurePosixPath(name.strip().strip('"').replace("\\", "/"))
@@ -142,7 +169,7 @@ def _picture(path: Path, data: bytes) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _load(path: Path, companions: _Companions) -> Mesh:
-    data = read_file(path, "a readable mesh file")
+    data = read_file(path, _READABLE)
     try:
         with _quiet_trimesh():
             if path.suffix.lower() == ".ply":
@@ -175,9 +202,7 @@ def _from_ply(path: Path, data: bytes, companions: _Companions) -> Mesh:
     """A ply, from trimesh's parse of its elements: its own conversion reorders vertices and forgets colours."""
     from trimesh.exchange.ply import load_ply
 
-    head, end, _ = data[: 1 << 16].partition(b"end_header")
-    if not head.startswith(b"ply") or not end:
-        raise BadInput(path, found="no ply header", needed="a whole .ply file")
+    head = _ply_head(path, data)
     parsed = load_ply(io.BytesIO(data), skip_materials=True, fix_texture=False)
     raw = parsed["metadata"]["_ply_raw"]
     for name in ("vertex", "face"):
@@ -189,13 +214,25 @@ def _from_ply(path: Path, data: bytes, companions: _Companions) -> Mesh:
         declared = f"{raw['vertex']['length']} and {raw['face']['length']}"
         raise BadInput(path, found=found, needed=f"the {declared} that its header declares")
     mesh = Mesh(vertices, faces, colours=_columns(raw["vertex"], ("red", "green", "blue"), np.uint8))
-    named = re.search(rb"comment\s+TextureFile\s+(.+)", head, flags=re.IGNORECASE)
-    if named is not None:
-        return _ply_texture(path, mesh, raw, named[1].decode(errors="replace").strip(), companions)
+    if (texture := _texture_name(head)) is not None:
+        return _ply_texture(path, mesh, raw, texture, companions)
     face_colours = _columns(raw["face"], ("red", "green", "blue"), np.uint8)
     if mesh.colours is None and face_colours is not None and len(face_colours) == len(faces):
         return _split_colours(mesh, face_colours)
     return mesh
+
+
+def _ply_head(path: Path, data: bytes) -> bytes:
+    """The header of a ply, from the file's first bytes."""
+    head, end, _ = data[: 1 << 16].partition(b"end_header")
+    if not head.startswith(b"ply") or not end:
+        raise BadInput(path, found="no ply header", needed="a whole .ply file")
+    return head
+
+
+def _texture_name(head: bytes) -> str | None:
+    named = re.search(rb"comment\s+TextureFile\s+(.+)", head, flags=re.IGNORECASE)
+    return None if named is None else named[1].decode(errors="replace").strip()
 
 
 def _ply_texture(path: Path, mesh: Mesh, raw: dict[str, Any], name: str, companions: _Companions) -> Mesh:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -19,7 +19,7 @@ from pipeline.bop.results import ResultRow
 from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rotation_angle_deg
-from pipeline.items.objects import ObjectModel
+from pipeline.items.objects import Mesh, ObjectModel
 from pipeline.items.scores import DatasetId, PoseErrors, Scores
 from pipeline.items.views import Target
 from pipeline.metrics.matching import best_scored, match
@@ -161,8 +161,8 @@ class Shape:
     """An object's mesh with the vertices that errors can be measured on."""
 
     def __init__(self, model: ObjectModel) -> None:
-        self.model = model
         self.vertices = model.mesh.vertices
+        self.model = replace(model, mesh=Mesh(self.vertices, model.mesh.faces))  # of all objects at once: no textures
         self.hull = hull_vertices(self.vertices)
         self.probes = self.hull[np.linspace(0, len(self.hull) - 1, min(PROBES, len(self.hull))).astype(int)]
 

@@ -75,6 +75,26 @@ def test_one_command_takes_a_dataset_to_poses_and_a_second_one_computes_nothing(
     assert {step: sum(counts) for step, counts in again.items()} == {step: sum(counts) for step, counts in made.items()}
 
 
+def test_a_run_that_finds_everything_looks_into_no_mesh(dzop, cache, monkeypatch):
+    dzop(f"store.root={cache}", "gallery=0")
+    monkeypatch.setattr("pipeline.bop.dataset.read_model", None)
+    assert dzop(f"store.root={cache}", "gallery=0").status == 0
+
+
+def test_a_mesh_that_does_not_fit_its_annotations_stops_a_run_that_finds_its_templates(
+    tmp_path, scene, cache, dzop, capsys, monkeypatch
+):
+    dzop(f"store.root={cache}", "step=onboard")
+    other = shutil.copytree(scene, tmp_path / "other")
+    info = json.loads((other / "models" / "models_info.json").read_text())
+    info["2"]["diameter"] *= 2
+    (other / "models" / "models_info.json").write_text(json.dumps(info))
+    dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={other}", f"store.root={cache}", *SMALL)
+    ran = run_dzop(capsys, monkeypatch, *dataset, "step=estimate", "cluster.count=7")
+    assert "obj_000002.ply: found a mesh of diameter" in ran.err
+    assert "poses" not in ran.out.split("targets")[-1]
+
+
 def test_the_same_run_gives_the_same_csv_but_for_its_times(dzop, tmp_path):
     dzop("store.root=a", "out=a/results")
     dzop("store.root=b", "out=b/results")

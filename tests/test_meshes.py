@@ -10,7 +10,7 @@ from PIL import Image
 from pipeline.errors import BadInput
 from pipeline.functional.shading import texture_colour
 from pipeline.items.objects import Mesh
-from pipeline.meshes import diameter_mm, read_mesh, write_ply
+from pipeline.meshes import diameter_mm, mesh_digest, read_mesh, write_ply
 
 # a unit square in two triangles; the texture has one colour per quarter
 SQUARE = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]], dtype=float)
@@ -143,6 +143,25 @@ def test_digest_follows_bytes_not_places(tmp_path):
     obj_with_mtl(second)
     (second / "c.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd skin.png\n# edited\n")
     assert read_mesh(first / "c.obj").digest != read_mesh(second / "c.obj").digest
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl"])
+def test_a_digest_alone_is_that_of_the_mesh(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    trimesh.Trimesh(SQUARE, SQUARE_FACES, process=False).export(path)
+    assert mesh_digest(path) == read_mesh(path).digest
+
+
+def test_the_digest_of_a_ply_follows_its_texture_and_parses_nothing(tmp_path, monkeypatch):
+    path = ply_with_vertex_uv(tmp_path)
+    whole = read_mesh(path).digest
+    monkeypatch.setattr("pipeline.meshes.read_mesh", None)
+    assert mesh_digest(path) == whole
+    Image.new("RGB", (8, 8)).save(tmp_path / "skin.png")
+    assert mesh_digest(path) != whole
+    (tmp_path / "skin.png").unlink()
+    with pytest.raises(BadInput, match=r"skin\.png.*no such file"):
+        mesh_digest(path)
 
 
 def test_binary_ply_comes_back_as_written(tmp_path):

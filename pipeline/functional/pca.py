@@ -21,7 +21,7 @@ def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Te
     mean = samples.mean(0)
     centred = samples - mean
     wide = centred.shape[0] < centred.shape[1]
-    variance, vectors = _leading(_gram(centred if wide else centred.T, exact=wide).astype(np.float64), dim)
+    variance, vectors = _leading(_gram(centred if wide else centred.T, exact=wide), dim)
     leading = torch.from_numpy(vectors).to(samples.device, samples.dtype)
     if wide:
         leading = centred.T @ (leading / torch.from_numpy(variance).sqrt().to(leading))
@@ -57,10 +57,12 @@ def projected(
 def _gram(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
     """Products of all pairs of rows: numpy knows x x^T for what it is, and computes half of it.
 
-    ``exact``, in float64 on the CPU: for few samples, whose axes are sums of them over the root of their variance.
+    ``exact``, float64: for few samples, whose axes are sums of them over the root of their variance. Otherwise in the
+    samples' own precision, which is as well that of the eigenvectors.
     """
     if x.device.type != "cpu":
-        return (x @ x.T).cpu().numpy()
+        gram = (x @ x.T).cpu().numpy()
+        return gram.astype(np.float64) if exact else gram
     a = (x.double() if exact else x).numpy()
     return a @ a.T
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 _CPU_BLOCK, _CUDA_BLOCK = 1 << 20, 1 << 27  # values: the CPU's fits its cache, CUDA's amortises launches
 _PAIRS_BLOCK = 1 << 22  # cell pairs compared at a time
+_EVEN = 4  # labels of up to this many times the mean number of rows are compared as they are, larger ones in parts
 
 
 def unit(x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
@@ -68,12 +69,21 @@ def nearest_of_label(
     """
     similarity = torch.full((len(a),), -torch.inf, device=a.device)
     index = torch.zeros(len(a), dtype=torch.int64, device=a.device)
-    labels = max(int(label.max()) + 1 if len(label) else 0 for label in (a_label, b_label))
-    a_groups, b_groups = _groups(a, a_label, labels), _groups(b, b_label, labels)
-    for (rows, a_rows), (columns, b_rows) in zip(a_groups, b_groups, strict=True):
-        if len(rows) and len(columns):
-            similarity[rows], nearest = _nearest(a_rows, b_rows)
-            index[rows] = columns[nearest]
+    if len(a) == 0 or len(b) == 0:
+        return similarity, index
+    labels = int(torch.maximum(a_label.max(), b_label.max())) + 1
+    there, columns = _by_label(b_label, most=len(b))
+    members = torch.full((labels, columns.shape[1]), -1, device=b.device).index_copy_(0, there, columns)
+    most = min(_EVEN * -(-len(a) // labels), max(1, _PAIRS_BLOCK // columns.shape[1]))
+    label, rows = _by_label(a_label, most=most)
+    values = max(a.shape[1], rows.shape[1]) * max(rows.shape[1], columns.shape[1])  # of a line: gathered or compared
+    for line, of in zip(*(x.split(max(1, _PAIRS_BLOCK // values)) for x in (rows, label)), strict=True):
+        others, real = members[of], line >= 0
+        others = others[:, : max(1, int((others >= 0).sum(1).max()))]  # as wide as the largest label of these lines
+        pairs = (a[line] @ b[others].mT).masked_fill_(others[:, None] < 0, -torch.inf)
+        best = pairs.max(dim=2)
+        similarity[line[real]] = best.values[real]
+        index[line[real]] = others.gather(1, best.indices)[real].clamp(min=0)
     return similarity, index
 
 
@@ -84,22 +94,22 @@ def best_per_group(
     index = candidate.nonzero()[:, 0]
     index = index[torch.sort(value[index], descending=True, stable=True).indices]
     ordered, by_group = torch.sort(group[index], stable=True)
-    first = torch.searchsorted(ordered, ordered)  # where each element's group starts
-    rank = torch.arange(len(ordered), device=ordered.device) - first
-    return index[by_group][rank < count]
+    return index[by_group][_rank(ordered) < count]
 
 
-def _groups(x: Float[Tensor, "m c"], label: Int[Tensor, " m"], labels: int) -> list[tuple[Tensor, Tensor]]:
-    """Indices and rows of the members of label 0, 1, ..."""
-    order = label.argsort(stable=True)
-    sizes = torch.bincount(label, minlength=labels).tolist()
-    return list(zip(order.split(sizes), x[order].split(sizes), strict=True))
+def _by_label(label: Int[Tensor, " m"], *, most: int) -> tuple[Int[Tensor, " l"], Int[Tensor, "l w"]]:
+    """Lines of indices of equal label, at most ``most`` in one and -1 after the last; and the label of each line."""
+    ordered, order = torch.sort(label, stable=True)
+    place = _rank(ordered) % most
+    row = (place == 0).cumsum(0) - 1
+    table = torch.full((int(row[-1]) + 1, int(place.max()) + 1), -1, device=label.device)
+    table[row, place] = order
+    return ordered[place == 0], table
 
 
-def _nearest(a: Float[Tensor, "m c"], b: Float[Tensor, "n c"]) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
-    """Highest a.b of each row of a, and its row of b; rows of a go in blocks to bound memory."""
-    best = [(rows @ b.T).max(dim=1) for rows in a.split(max(1, _PAIRS_BLOCK // len(b)))]
-    return torch.cat([found.values for found in best]), torch.cat([found.indices for found in best])
+def _rank(ordered: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+    """How many equals stand before each element of a sorted list."""
+    return torch.arange(len(ordered), device=ordered.device) - torch.searchsorted(ordered, ordered)
 
 
 def _float_blocks(bank: Tensor) -> Iterator[Tensor]:

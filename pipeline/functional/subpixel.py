@@ -23,8 +23,8 @@ def neighbourhood_shift(
     subtracted. Without it silhouettes pull inwards, and a perfect match moves by a tenth of a cell.
     """
     offset, index, counts = _neighbours(mask, cell, kernel=kernel)
-    around = template.flatten(0, 1)[index]
-    own = template.flatten(0, 1)[cell]
+    flat = template.flatten(0, 1)
+    around, own = flat.index_select(0, index.flatten()).unflatten(0, index.shape), flat.index_select(0, cell)
     return _mean_offset(query, around, counts, offset) - _mean_offset(own, around, counts, offset)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -53,9 +53,21 @@ class Context:
         return sorted({(target.scene_id, target.im_id) for target in self.targets})
 
     @cached_property
-    def model(self) -> Callable[[int], ObjectModel]:
+    def model(self) -> Kept[int, ObjectModel]:
         """An object's mesh; the last ones stay in memory, so that it does not grow with the number of objects."""
-        return Kept(self.dataset.object_model, _mesh_bytes, MESHES_BYTES)
+        return Kept(self._model, _mesh_bytes, MESHES_BYTES)
+
+    def _model(self, obj_id: int) -> ObjectModel:
+        model = self.dataset.object_model(obj_id)
+        if model.mesh.digest != self.mesh_digest(obj_id):
+            found = "other bytes than when its key was made"
+            raise BadInput(self.dataset.model_path(obj_id), found=found, needed="a mesh that no one writes meanwhile")
+        return model
+
+    @cached_property
+    def mesh_digest(self) -> Callable[[int], str]:
+        """Digest of an object's mesh, which keys are made from; the mesh itself is read where something is computed."""
+        return lru_cache(maxsize=None)(self.dataset.mesh_digest)
 
     @cached_property
     def rates(self) -> Rates:

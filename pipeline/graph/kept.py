@@ -28,3 +28,7 @@ class Kept(Generic[K, V]):
         while len(self.values) > 1 and sum(map(self.size, self.values.values())) > self.limit:
             self.values.popitem(last=False)
         return self.values[key]
+
+    def forget(self, key: K) -> None:
+        """Let a value go."""
+        self.values.pop(key, None)

@@ -80,8 +80,7 @@ class QueryNodes:
         inputs = {"crops": self.crops(image).key}
         if self.run.stages.extract.needs_geometry:
             poses = [
-                [d.obj_id, self.run.model(d.obj_id).mesh.digest, self.true_pose(d).tolist()]
-                for _, d in self.of_image[image]
+                [d.obj_id, self.run.mesh_digest(d.obj_id), self.true_pose(d).tolist()] for _, d in self.of_image[image]
             ]
             inputs["geometry"] = digest([poses, self.run.K(image).tolist()])
         return self.run.features(layer, inputs)

@@ -67,7 +67,7 @@ class TemplateNodes:
 
     def _templates(self, obj_id: int) -> Ref:
         recipe = {"kind": "templates", "render": self.run.stages.render.recipe()}
-        return make_ref("templates", recipe, {"mesh": self.run.model(obj_id).mesh.digest})
+        return make_ref("templates", recipe, {"mesh": self.run.mesh_digest(obj_id)})
 
     def crops(self, obj_id: int) -> Ref:
         """Their crops."""
@@ -80,8 +80,13 @@ class TemplateNodes:
 
     def make_templates(self, obj_id: int) -> int:
         """Render what is missing of an object's templates; returns how many there are."""
+        ref = self.templates(obj_id)
+        if self.run.store.complete(ref):
+            rows = self.run.store.read(ref).rows
+            self.run.tally.add("templates", reused=rows)
+            return rows
         K, T_cam_obj, (height, width) = self.run.stages.render.cameras(self.run.model(obj_id).mesh)
-        ref, count = self.templates(obj_id), len(T_cam_obj)
+        count = len(T_cam_obj)
 
         def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
             rgb, depth_mm = self.run.stages.render.render(
@@ -206,6 +211,7 @@ class TemplateNodes:
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
+        self.run.model.forget(obj_id)  # and with the mesh what the renderer made of it, three times as large
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.run.stages.layers)
         self.make_fitted(obj_id)

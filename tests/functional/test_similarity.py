@@ -57,7 +57,7 @@ def test_nearest_of_label_equals_a_loop(monkeypatch):
     a, b = unit(_random(40, 5)), unit(_random(30, 5, seed=1))
     generator = torch.Generator().manual_seed(2)
     a_label, b_label = torch.randint(0, 6, (40,), generator=generator), torch.randint(0, 5, (30,), generator=generator)
-    for block in (1 << 22, 8):
+    for block in (1 << 22, 1 << 7, 8):
         monkeypatch.setattr(similarity, "_PAIRS_BLOCK", block)
         value, index = nearest_of_label(a, a_label, b, b_label)
         for i in range(40):
@@ -68,6 +68,15 @@ def test_nearest_of_label_equals_a_loop(monkeypatch):
             best = max(members, key=lambda j: float(a[i] @ b[j]))
             assert index[i] == best
             assert abs(float(value[i] - a[i] @ b[best])) < 1e-6  # float32, another order of sums
+
+
+def test_a_label_far_larger_than_the_others_is_compared_in_parts():
+    a, b = unit(_random(300, 5)), unit(_random(200, 5, seed=1))
+    a_label, b_label = (torch.arange(n).sub(n - 30).clamp(min=0) for n in (300, 200))  # 0 but for the last 29
+    similarity_matrix = (a @ b.T).masked_fill(a_label[:, None] != b_label, -torch.inf)
+    value, index = nearest_of_label(a, a_label, b, b_label)
+    assert torch.equal(index, similarity_matrix.argmax(1))
+    assert torch.allclose(value, similarity_matrix.max(1).values, atol=1e-6)  # float32, another order of sums
 
 
 def test_best_per_group_keeps_the_highest_and_of_equals_the_first():

@@ -39,11 +39,12 @@ class Cosine(Spec):
         if len(query_cell) == 0 or len(template_cell) == 0:
             raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
         query = unit(pair.query.float().movedim(0, -1).flatten(0, 1)[query_cell])
-        template = unit(pair.template.float().movedim(0, -1))
-        similarity, nearest = nearest_of_label(query, query_pair, template.flatten(0, 1)[template_cell], template_pair)
+        template = unit(pair.template.float().movedim(0, -1)).contiguous()
+        inside = template.flatten(0, 1).index_select(0, template_cell)
+        similarity, nearest = nearest_of_label(query, query_pair, inside, template_pair)
         candidate = similarity > 0
         if self.mutual:
-            _, back = nearest_of_label(template.flatten(0, 1)[template_cell], template_pair, query, query_pair)
+            _, back = nearest_of_label(inside, template_pair, query, query_pair)
             candidate &= back[nearest] == torch.arange(len(query), device=query.device)
         limit = self.per_cluster if len(clusters.pairs) > 1 else len(query)
         kept = best_per_group(similarity, query_pair, candidate, count=limit)
