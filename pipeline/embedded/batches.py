@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from pipeline.embedded.dressing import dressed, scanned
+from pipeline.embedded.dressing import dressed
 from pipeline.embedded.pictures import Picture, View, photograph, template
 from pipeline.embedded.views import (
     CLUSTERS_PER_OBJECT,
@@ -82,21 +82,18 @@ def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n 
     return torch.from_numpy(np.stack([p.rgb for p in made]))
 
 
-def pair_batch(source: Source, step: int, *, count: int, hard: bool = True, scans: bool = True) -> PairBatch:
+def pair_batch(source: Source, step: int, *, count: int, hard: bool = True) -> PairBatch:
     """Two photographs of the query's view of every cluster of ``count`` objects, and its other views as templates.
 
     ``hard``: with surfaces of their own (dressing), other objects in front of them, shadows and worse masks.
-    ``scans``: templates of some objects lack what a mesh of the real one would (dressing.scanned).
     """
     objects, rng = source.objects(step, count, dress=hard)
     pictures: list[Picture] = []
     parts, angles = [], []
     for clusters, others in zip(objects, objects[1:] + objects[:1], strict=True):
-        wear = int(rng.integers(2**32)) if scans else None
         for views in clusters:
             queries = [photograph(views[0], rng, other=_any(others, rng) if hard else None) for _ in range(QUERIES)]
-            drawn = views[1:] if wear is None else scanned(views[1:], np.random.default_rng(wear))
-            pictures += queries + [template(view, rng) for view in drawn]
+            pictures += queries + [template(view, rng) for view in views[1:]]
             parts += [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
         R_template = _rotations([view for views in clusters for view in views[1:]])
         for views in clusters:

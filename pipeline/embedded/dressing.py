@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 
 from pipeline.embedded.pictures import View
 from pipeline.synthetic.parts import Rng, random_direction
@@ -26,35 +25,6 @@ def dressed(clusters: list[list[View]], rng: Rng) -> list[list[View]]:
     coats = [_coat(rng) for _ in range(int(rng.choice([0, 1, 2, 4], p=[0.35, 0.25, 0.25, 0.15])))]
     relief = _relief(rng) if rng.uniform() < 0.5 else None
     return [[_dressed(view, coats, relief) for view in views] for views in clusters]
-
-
-def scanned(views: list[View], rng: Rng) -> list[View]:
-    """The views as a mesh made by a scanner or a draughtsman has them: colours and shapes washed out, or no colours."""
-    kind, soft, smooth = rng.uniform(), rng.uniform(0.7, 4.0), rng.uniform(0.5, 2.5)
-    grey = float(rng.uniform(80, 220))
-    if kind < 0.45:
-        return views
-    if kind < 0.7:
-        return [replace(view, albedo=np.full_like(view.albedo, round(grey))) for view in views]
-    return [_washed_out(view, soft, smooth if kind < 0.85 else 0.0) for view in views]
-
-
-def _washed_out(view: View, soft: float, smooth: float) -> View:
-    albedo = _blurred(view.albedo.astype(np.float32), view.mask, soft)
-    normal = view.normal
-    if smooth:
-        normal = _blurred(view.normal, view.mask, smooth)
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-    return replace(view, albedo=np.rint(albedo).astype(np.uint8), normal=normal)
-
-
-def _blurred(
-    values: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"], sigma: float
-) -> Float32[np.ndarray, "S S 3"]:
-    """A Gaussian mean over the mask alone."""
-    inside = mask.astype(np.float32)
-    total = cv2.GaussianBlur(values * inside[..., None], (0, 0), sigma)
-    return np.asarray(total / np.maximum(cv2.GaussianBlur(inside, (0, 0), sigma), 1e-3)[..., None])
 
 
 Coat = Callable[[Points], tuple[Bool[np.ndarray, " m"], Float[np.ndarray, " 3"]]]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.embedded import losses
-from pipeline.embedded.batches import PairBatch, Source, pair_batch, picture_batch
+from pipeline.embedded.batches import Source, pair_batch, picture_batch
 from pipeline.functional.aggregation import Aggregation
 from pipeline.stages.extract.decoder import decoder_maps, map_shape
 from pipeline.stages.extract.diffusion import clean_latent, network_image
@@ -49,18 +49,13 @@ _EMA, _WARMUP = 0.998, 50
 
 @dataclass(frozen=True)
 class Plan:
-    """How many steps each stage takes, and what of.
-
-    The first ``easy`` steps of the descriptors are on easier pictures, the first ``faithful`` on templates that show
-    all that the queries' objects have.
-    """
+    """How many steps each stage takes, and what of; the first ``easy`` of the descriptors are on easier pictures."""
 
     shards: int = 150
     autoencoder: int = 500
     denoiser: int = 400
-    descriptors: int = 7400
+    descriptors: int = 5300
     easy: int = 2700
-    faithful: int = 5300
     seed: int = 0
 
 
@@ -177,8 +172,7 @@ class Descriptors(Stage):
 
     def loss(self, step: int) -> dict[str, Tensor]:
         """Both losses of 2 objects' 2 clusters of 8 pictures."""
-        harder = {"hard": step >= self.plan.easy, "scans": step >= self.plan.faithful}
-        batch = pair_batch(self.source, step, count=2, **harder)
+        batch = pair_batch(self.source, step, count=2, hard=step >= self.plan.easy)
         return described_losses(self.model, self.encode(batch.rgb), batch)
 
 
@@ -199,7 +193,7 @@ class Described(nn.Module):
             return self.head(maps), maps[MATCH_LAYER]
 
 
-def described_losses(model: Described, latent: Tensor, batch: PairBatch) -> dict[str, Tensor]:
+def described_losses(model: Described, latent: Tensor, batch: Any) -> dict[str, Tensor]:
     """Correspondence and retrieval loss of a batch."""
     descriptors, coarse = model(latent)
     scale = model.log_scale.clamp(max=math.log(60.0)).exp()

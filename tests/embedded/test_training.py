@@ -11,7 +11,6 @@ import torch
 
 from pipeline.embedded import losses, views
 from pipeline.embedded.batches import CELLS, QUERIES, TEMPLATES, Source, pair_batch, picture_batch
-from pipeline.embedded.dressing import scanned
 from pipeline.embedded.export import export
 from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
 from pipeline.embedded.views import CLUSTERS_PER_OBJECT
@@ -65,23 +64,6 @@ def test_correspondences_end_on_the_object_and_angles_are_those_of_all_templates
         own = batch.angle_deg[0, c, 0, c * TEMPLATES : (c + 1) * TEMPLATES]
         assert float(own[0]) < 10
         assert float(own.min()) == float(batch.angle_deg[0, c, 0].min())
-
-
-def test_a_scans_templates_lose_colours_and_never_their_outline(shards):
-    objects, _ = source(shards).objects(0, 1)
-    views_of = objects[0][0]
-    lost = []
-    for seed in range(12):
-        worn = scanned(views_of, np.random.default_rng(seed))
-        lost.append(not np.array_equal(worn[0].albedo, views_of[0].albedo))
-        for before, after in zip(views_of, worn, strict=True):
-            assert np.array_equal(before.mask, after.mask)
-            assert np.abs(np.linalg.norm(after.normal[after.mask], axis=-1) - 1).max() < 0.05
-        spread = [np.ptp(w.albedo[w.mask].astype(int), axis=0).max() for w in worn]
-        assert all(
-            s <= np.ptp(v.albedo[v.mask].astype(int), axis=0).max() for s, v in zip(spread, views_of, strict=True)
-        )
-    assert 0 < sum(lost) < 12
 
 
 def test_the_loss_is_least_where_cosines_peak_at_the_true_places(shards):
