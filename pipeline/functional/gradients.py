@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 ORIENTATIONS, CONTRAST = 8, 0.02
+EDGES = 12  # the layer of edge histograms: past the decoder's 0 to 11
 
 
 def edge_histograms(

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from pipeline.errors import BadInput
+from pipeline.functional.gradients import EDGES
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
-from pipeline.stages.extract.embedded import EDGES, Embedded
+from pipeline.stages.extract.embedded import Embedded
 from pipeline.stages.extract.fitting import maps_bytes
 from pipeline.stages.fuse.auto import Auto
 from pipeline.stages.fuse.learned import Learned

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from pipeline.digests import file_digest
 from pipeline.errors import BadInput
-from pipeline.functional.gradients import ORIENTATIONS, edge_histograms
+from pipeline.functional.gradients import EDGES, ORIENTATIONS, edge_histograms
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, digest, spec
@@ -30,7 +30,6 @@ from pipeline.stages.extract.noise import NoiseMode
 from pipeline.stages.extract.weights import alphas_cumprod
 
 FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
-EDGES = 12  # the layer past the decoder's
 PROMPT = (1, 1, 32)  # of zeros: the model knows no text
 
 WeightSet = Literal["learned", "pure"]
@@ -75,7 +74,8 @@ class Embedded(DiffusionFeatures):
 
     def load(self, runtime: Runtime) -> EmbeddedBackbone:
         """As DiffusionFeatures.load."""
-        return EmbeddedBackbone(self, super().load(runtime))
+        decoder = super().load(runtime)
+        return EmbeddedBackbone(self, decoder.architecture, decoder.model, decoder.batch)
 
     def recipe(self) -> dict[str, Any]:
         """As DiffusionFeatures.recipe, with the digest of the weights behind the name of the set."""
@@ -100,22 +100,19 @@ class Embedded(DiffusionFeatures):
         return digest([_digest_of(path) for path in files])
 
 
-class EmbeddedBackbone:
+class EmbeddedBackbone(DiffusionBackbone):
     """The model in memory, and edges."""
-
-    def __init__(self, spec: Embedded, decoder: DiffusionBackbone) -> None:
-        self.spec, self.decoder, self.batch = spec, decoder, decoder.batch
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, in the spec's dtype, on the model's device."""
-        maps = self.decoder(crops, _decoder(layers)) if _decoder(layers) else {}
+        maps = super().__call__(crops, _decoder(layers)) if _decoder(layers) else {}
         if EDGES in layers:
             chunks = [self._edges(crops[i : i + self.batch]) for i in range(0, len(crops), self.batch)]
             maps = {**maps, EDGES: torch.cat(chunks)}
         return maps
 
     def _edges(self, crops: Crops) -> Float[Tensor, "n 8 h w"]:
-        device = self.decoder.model.prompt.device
+        device = self.model.prompt.device
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (crops.rgb, crops.mask))
         edges = edge_histograms(rgb, mask, cells=self.spec.feature_shape(EDGES)[1])
         return edges.to(getattr(torch, self.spec.dtype))

@@ -14,10 +14,9 @@ from torch import Tensor
 from pipeline.digests import file_digest
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
-from pipeline.functional.gradients import with_edges
+from pipeline.functional.gradients import EDGES, with_edges
 from pipeline.items.features import FusedPair
 from pipeline.spec import PositiveFloat, Spec, spec
-from pipeline.stages.extract.embedded import EDGES
 from pipeline.stages.fuse import Layers, fused
 
 LAYERS = (2, 5, 8, 11)
