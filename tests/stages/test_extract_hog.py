@@ -108,7 +108,11 @@ def test_silhouette_can_be_left_out() -> None:
 
 def test_energy_is_shared_out_completely() -> None:
     rgb, mask = torch.from_numpy(noise(1)), torch.ones(1, 128, 128, dtype=torch.bool)
-    sums = [oriented_energy(rgb, mask, orientations=n, signed=s, silhouette=1.0).sum(1) for n in (8, 9) for s in (False, True)]
+    sums = [
+        oriented_energy(rgb, mask, orientations=n, signed=s, silhouette=1.0).sum(1)
+        for n in (8, 9)
+        for s in (False, True)
+    ]
     for other in sums[1:]:
         torch.testing.assert_close(other, sums[0])
 
