@@ -104,6 +104,11 @@ def test_descriptors_and_edges_share_a_cosine_by_the_square_of_their_weight():
     torch.testing.assert_close(inner(Learned(edges=2.0)) - cosine, 4 * (inner(Learned(edges=1.0)) - cosine))
 
 
+def test_the_weight_of_edges_is_part_of_the_key_where_there_are_any():
+    assert Learned(edges=2.0).recipe() != Learned().recipe()
+    assert Learned(layers=LAYERS, edges=2.0).recipe() == Learned(layers=LAYERS).recipe()
+
+
 def test_the_head_refuses_features_it_was_not_trained_on():
     Learned().check(Embedded().model)
     with pytest.raises(BadInput, match=r"features of embedded-pure-.* needs extract=embedded extract.weights=learned"):

@@ -54,8 +54,9 @@ class Learned(Spec):
             raise BadInput("fuse.layers", found=list(self.layers), needed=needed)
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe, with the digest of the head's weights."""
-        return super().recipe() | {"weights": _digest()}
+        """As Spec.recipe, with the digest of the head's weights; without edges, their weight cannot matter."""
+        known = super().recipe() | {"weights": _digest()}
+        return known if EDGES in self.layers else known | {"edges": 0.0}
 
     def __call__(
         self,
