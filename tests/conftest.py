@@ -1,6 +1,8 @@
 """Fixtures every test may use. Shapes in annotations are checked while tests run."""
 
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,14 @@ def bop_mini() -> Path:
 def bop_reference() -> Path:
     """bop_toolkit's own values of the pose errors."""
     return _shared("reference", "bop_metrics")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A module's feature store, which goes with it: nothing that tests write takes as much room."""
+    folder = tmp_path_factory.mktemp("cache")
+    yield folder
+    shutil.rmtree(folder)
 
 
 @pytest.fixture(scope="session")

@@ -32,12 +32,6 @@ def scene(tmp_path_factory) -> Path:
     return root
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory, scene) -> Path:
-    """Templates and features of the small dataset, for the tests that are not about making them."""
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def dzop(capsys, monkeypatch, tmp_path, scene):
     monkeypatch.chdir(tmp_path)

@@ -29,11 +29,6 @@ def weights(tmp_path_factory) -> list[str]:
     return write_weights(tmp_path_factory.mktemp("weights"))
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def dzop(capsys, monkeypatch, tmp_path, weights):
     root = write_tiny_bop(tmp_path / "tiny")

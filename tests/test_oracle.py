@@ -72,8 +72,8 @@ def scenes(tmp_path_factory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Store:
-    return Store(LocalStoreConfig(root=str(tmp_path_factory.mktemp("oracle") / "cache")))
+def store(cache) -> Store:
+    return Store(LocalStoreConfig(root=str(cache)))
 
 
 def errors(scenes: Dataset, store: Store, **changes: object) -> list[PoseErrors]:

@@ -28,11 +28,6 @@ def scene(tmp_path_factory) -> Path:
     return root
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def command(tmp_path, scene, cache):
     def build(*arguments: str) -> list[str]:
