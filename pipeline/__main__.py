@@ -202,7 +202,10 @@ def stages_of(values: Mapping[str, Any]) -> Stages:
         chosen["fuse"] = chosen["fuse"].resolve_for(_model_of(chosen["extract"]))
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
-    return Stages(**chosen, fallback=values["fallback"])
+    looks = values["second_look"]["hypotheses"]
+    if not isinstance(looks, int) or isinstance(looks, bool) or looks < 0:
+        raise BadInput("second_look.hypotheses", found=repr(looks), needed="a whole number, 0 or more")
+    return Stages(**chosen, fallback=values["fallback"], second_look=looks)
 
 
 def _model_of(extract: Any) -> str:

@@ -3,6 +3,7 @@
 mesh -render-> templates -crop, extract-> template features -fit->     (offline, once for every object)
 image -detect, crop, extract-> query features                          (once for every image)
 query, templates -match-> template -fuse, cluster, correspond-> points -lift, solve-> hypotheses -choose, refine-> pose
+the worthiest poses -render, crop, extract-> templates of this very query -fuse, ..., refine-> pose   (a second look)
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pipeline.errors import NoPose
@@ -47,7 +48,11 @@ ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "r
 
 @dataclass(frozen=True)
 class Stages:
-    """Which variant at each stage, and whether a template's own pose may stand in for a failed solver."""
+    """Which variant at each stage.
+
+    ``fallback``: a template's own pose may stand in for a failed solver. ``second_look``: that many of the worthiest
+    hypotheses are drawn at their pose, and matched with that picture in place of their template's; 0: none.
+    """
 
     render: Renderer
     extract: Extractor
@@ -61,6 +66,7 @@ class Stages:
     refine: Refiner
     detect: Detector | DescribingDetector
     fallback: bool = False
+    second_look: int = 0
 
     @property
     def need_truth(self) -> str:
@@ -103,7 +109,7 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class TemplateView:
-    """One template as correspondences need it."""
+    """One template as correspondences need it. ``rgb``: its crop, where it was drawn for a query and is not stored."""
 
     features: Mapping[int, Float[Tensor, "c h w"]]
     mask: Bool[Tensor, "S S"]
@@ -111,6 +117,7 @@ class TemplateView:
     depth_mm: Float[np.ndarray, "H W"]
     K: Float[np.ndarray, "3 3"]
     T_cam_obj: Float[np.ndarray, "4 4"]
+    rgb: UInt8[np.ndarray, "S S 3"] | None = None
 
 
 class TemplateBank(Protocol):
@@ -135,6 +142,15 @@ class TemplateBank(Protocol):
         """Everything about one template."""
         ...
 
+    def draw(
+        self,
+        T_cam_obj: Float[np.ndarray, "4 4"],
+        A_crop_img: Float[np.ndarray, "3 3"],
+        K: Float[np.ndarray, "3 3"],
+    ) -> TemplateView:
+        """The object in a pose, as a crop of an image of K shows it, with its features."""
+        ...
+
     def fitted(self, fit: Fit) -> Fitted:
         """What was fitted to the templates."""
         ...
@@ -142,7 +158,10 @@ class TemplateBank(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one template led to; ``solution`` None with the ``failure`` that stopped it."""
+    """What one template led to; ``solution`` None with the ``failure`` that stopped it.
+
+    ``drawn``: the view that it was matched with at a second look, from where ``template_id`` had led to.
+    """
 
     template_id: int
     template_score: float
@@ -153,6 +172,7 @@ class Hypothesis:
     query_px_img: Float[np.ndarray, "m 2"] | None = None
     solution: PoseSolution | None = None
     failure: NoPose | None = None
+    drawn: TemplateView | None = None
 
     @property
     def inliers(self) -> int:
@@ -202,10 +222,13 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     with clock("match"):
         match = _match(stages, query, bank)
     ranked = zip(match.index.tolist(), match.score.tolist(), strict=True)
-    hypotheses = [_hypothesis(stages, query, bank, index, score, clock) for index, score in ranked]
-    if len(hypotheses) > 1:
-        with clock("choose"):  # stable: equals stay in the order of their templates
-            hypotheses.sort(key=lambda h: -_worth(stages, query, bank, h))
+    hypotheses = [_hypothesis(stages, query, bank, Hypothesis(index, score), clock) for index, score in ranked]
+    _sort(stages, query, bank, hypotheses, clock)
+    if stages.second_look:
+        most = min(stages.second_look, len(hypotheses))
+        looked = [_looked_again(stages, query, bank, h, clock) for h in hypotheses[:most]]
+        _sort(stages, query, bank, looked, clock)
+        hypotheses[:most] = looked
     hypotheses[0] = _refined(stages, query, bank, hypotheses[0], clock)
     return Trace(match, tuple(hypotheses), clock.times_s)
 
@@ -213,7 +236,32 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
 def retrace_pose(stages: Stages, query: Query, bank: TemplateBank, template_id: int, score: float) -> Hypothesis:
     """What one template led to, refined, as it was in the trace that chose it."""
     clock = Clock()
-    return _refined(stages, query, bank, _hypothesis(stages, query, bank, template_id, score, clock), clock)
+    found = _hypothesis(stages, query, bank, Hypothesis(template_id, score), clock)
+    if stages.second_look:
+        found = _looked_again(stages, query, bank, found, clock)
+    return _refined(stages, query, bank, found, clock)
+
+
+def _sort(stages: Stages, query: Query, bank: TemplateBank, hypotheses: list[Hypothesis], clock: Clock) -> None:
+    """Worthiest first; equals stay in their order."""
+    if len(hypotheses) > 1:
+        with clock("choose"):
+            hypotheses.sort(key=lambda h: -_worth(stages, query, bank, h))
+
+
+def _looked_again(stages: Stages, query: Query, bank: TemplateBank, first: Hypothesis, clock: Clock) -> Hypothesis:
+    """The hypothesis that a view drawn in the first one's pose leads to; the first where that leads nowhere.
+
+    Drawn as the query's own crop would show it, the view has the query's scale and place and no template's error of
+    view: what is left to match is near, and outlines are those of the pose itself.
+    """
+    if first.solution is None:
+        return first
+    with clock("draw"):
+        drawn = bank.draw(first.solution.T_cam_obj, query.A_crop_img, query.K)
+    start = Hypothesis(first.template_id, first.template_score, drawn=drawn)
+    second = _hypothesis(stages, query, bank, start, clock)
+    return first if second.solution is None else second
 
 
 def _match(stages: Stages, query: Query, bank: TemplateBank) -> TemplateMatch:
@@ -225,11 +273,12 @@ def _match(stages: Stages, query: Query, bank: TemplateBank) -> TemplateMatch:
     return stages.match(features, query.mask, bank.features, bank.mask)
 
 
-def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, score: float, clock: Clock) -> Hypothesis:
+def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, start: Hypothesis, clock: Clock) -> Hypothesis:
+    """``start`` with what its view leads to."""
     parts: dict[str, object] = {}
     try:
         with clock("read template"):
-            template = bank.view(index)
+            template = _view(bank, start)
         with clock("fuse"):
             pair = _with_saliency(_fused(stages, query, template, bank), query, template)
             parts["pair"] = pair
@@ -249,7 +298,11 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, index: int, sc
             parts["solution"] = _solved(stages, query, points_obj, query_px_img, seen)
     except NoPose as failure:
         parts["failure"] = failure
-    return Hypothesis(index, score, **parts)  # type: ignore[arg-type]
+    return replace(start, **parts)  # type: ignore[arg-type]
+
+
+def _view(bank: TemplateBank, found: Hypothesis) -> TemplateView:
+    return bank.view(found.template_id) if found.drawn is None else found.drawn
 
 
 def _fused(stages: Stages, query: Query, template: TemplateView, bank: TemplateBank) -> FusedPair:
@@ -295,7 +348,7 @@ def _worth(stages: Stages, query: Query, bank: TemplateBank, found: Hypothesis) 
     """What choose makes of a hypothesis; less than of any other where there is no pose."""
     if found.solution is None or found.pair is None:
         return -1.0
-    _, points_obj = _template_cells(stages, bank.view(found.template_id), found.pair)
+    _, points_obj = _template_cells(stages, _view(bank, found), found.pair)
     K_crop, size = query.A_crop_img @ query.K, stages.crop.size
     return stages.choose(found.solution.T_cam_obj, found.inliers, found.pair, points_obj, K_crop, crop_size=size)
 
@@ -309,7 +362,7 @@ def _refined(stages: Stages, query: Query, bank: TemplateBank, best: Hypothesis,
     if best.solution is None or best.pair is None or best.points_obj is None or best.query_px_img is None:
         return best
     with clock("refine"):
-        _, points_obj = _template_cells(stages, bank.view(best.template_id), best.pair)
+        _, points_obj = _template_cells(stages, _view(bank, best), best.pair)
         K_crop = query.A_crop_img @ query.K
         T_cam_obj = stages.refine(best.solution.T_cam_obj, best.pair, points_obj, K_crop, crop_size=stages.crop.size)
     if np.array_equal(T_cam_obj, best.solution.T_cam_obj):

@@ -54,7 +54,7 @@ def test_a_variation_names_itself_and_changes_what_it_says(name):
         "no_subpixel": {"correspond"},
         "oracle_mask": set(),
         "oracle_template": {"match"},
-        "oracle_correspondences": {"match", "correspond", "refine"},
+        "oracle_correspondences": {"match", "correspond", "refine", "second_look"},
     }[name]
     assert {key for key in plain if plain[key] != config[key]} - {"variation"} == expected
 

@@ -162,13 +162,18 @@ class Context:
             return
 
         def compute(batch: list[int]) -> dict[str, dict[str, np.ndarray]]:
-            maps = self.backbone(crops(batch), tuple(missing))
-            return {ref.key: {"maps": _half(maps[layer], layer)} for layer, ref in missing.items()}
+            maps = self.maps(crops(batch), tuple(missing))
+            return {ref.key: {"maps": maps[layer]} for layer, ref in missing.items()}
 
         layouts = {ref: self.features_layout(layer) for layer, ref in missing.items()}
         batch = self.backbone.batch  # loads the weights: their seconds are no part of a row's
         work = work_of("features", self.stages, list(missing))
         self.fill(step, title, layouts, rows, self.runtime.batch or batch, compute, work=work)
+
+    def maps(self, crops: Crops, layers: Sequence[int]) -> dict[int, np.ndarray]:
+        """Feature maps of crops as they are stored: float16, on the CPU."""
+        maps = self.backbone(crops, layers)
+        return {layer: _half(maps[layer], layer) for layer in layers}
 
 
 def stacked(crops: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:

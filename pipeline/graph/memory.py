@@ -15,6 +15,7 @@ import torch
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
+from pipeline.graph.templates import DRAWN_LARGER
 from pipeline.stages.extract.fitting import SHARE, Footprint, Sized, fitting_batch
 from pipeline.stages.match import FittedMatcher, TruthMatcher
 from pipeline.tally import human
@@ -89,6 +90,7 @@ class Need:
     bank: int
     view: int
     online: int
+    look: int
     unknown: tuple[str, ...] = field(default_factory=tuple)
 
 
@@ -119,6 +121,7 @@ def need_of(run: Context, described: ProposalNodes | None) -> Need:
         bank=bank,
         view=2 * sum(values.values()) + crop + 4 * h * w,
         online=16 * finest * sum(shapes[layer][0] for layer in stages.fuse.layers),
+        look=DRAWN_LARGER**2 * crop * (8 + 2 * _RAY_BYTES) if stages.second_look else 0,
         unknown=unknown,
     )  # fmt: skip
 
@@ -155,6 +158,8 @@ def memory_of(run: Context, need: Need, *, least: bool = False) -> tuple[Memory,
         a_batch = need.footprint.a_pass + batch * need.footprint.a_crop
     views = 1 if least else views_kept(run, need)
     bank = need.bank + need.online + views * need.view
+    if need.look and need.footprint is not None:  # a pass while the templates are there
+        bank += need.look + need.footprint.a_pass + need.footprint.a_crop
     working = {f"{_BATCH} of {batch}": a_batch, _BANK: bank} if a_batch else {_BANK: bank}
     drawing, unknown = {"rendering": need.render, _FITS: need.fits}, ", ".join(need.unknown)
     if device.type == "cpu":

@@ -69,7 +69,8 @@ class Plan:
         for group, targets in self.poses.groups.items():
             of, n = f"scene {group[0]} object {group[1]}", len(targets)
             work = work_of("poses", self.run.stages, rows=self._views(group[1]))
-            yield self._node("poses", of, self.poses.poses(group), None, f"{n} targets", work, n)
+            passes = n * self.run.stages.second_look
+            yield self._node("poses", of, self.poses.poses(group), None, f"{n} targets", work, n, passes)
 
     def _views(self, obj_id: int) -> int:
         return len(self.run.stages.render.cameras(self.run.model(obj_id).mesh)[1])

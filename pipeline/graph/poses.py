@@ -48,6 +48,8 @@ class PoseNodes:
         stages, (_, obj_id) = self.run.stages, group
         recipe = {"kind": "poses", "version": POSES_VERSION, "fallback": stages.fallback}
         recipe |= {name: getattr(stages, name).recipe() for name in ONLINE_STAGES}
+        if stages.second_look:  # what it draws and extracts with is in the keys of the templates and their features
+            recipe["second look"] = stages.second_look
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
             inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key

@@ -80,5 +80,6 @@ def work_of(step: str, stages: Stages, layers: Sequence[int] = (), rows: int = 0
     if step == "fits":
         return digest([step, stages.extract.recipe(), [fit.recipe() for fit in stages.fits], stages.render.recipe()])
     if step == "poses":
-        return digest([step, stages.extract.recipe(), [getattr(stages, name).recipe() for name in ONLINE_STAGES], rows])
+        online = [getattr(stages, name).recipe() for name in ONLINE_STAGES]
+        return digest([step, stages.extract.recipe(), online, rows, stages.second_look])
     return digest([step, (stages.render if step == "templates" else stages.crop).recipe()])

@@ -18,7 +18,7 @@ from pipeline.route import Hypothesis, retrace_pose
 
 @dataclass(frozen=True, eq=False)
 class Retraced:
-    """A detection's crop, its best template's crop and what became of the two; None for what was not reached."""
+    """A detection's crop, that of the view it was matched with, and what became of both; None: not reached."""
 
     detection: Detection
     query_rgb: UInt8[np.ndarray, "S S 3"]
@@ -49,5 +49,7 @@ class Retracer:
         score = answer.template_score if isinstance(answer, PoseEstimate) else 0.0
         bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
         hypothesis = retrace_pose(run.stages, query, bank, answer.template_id, score)
+        if hypothesis.drawn is not None:
+            return Retraced(detection, query_rgb, hypothesis.drawn.rgb, hypothesis)
         crops = run.store.read(self.templates.crops(answer.obj_id))
         return Retraced(detection, query_rgb, crops.array("rgb", [answer.template_id])[0], hypothesis)

@@ -5,23 +5,32 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from pipeline.errors import DzopError
+from pipeline.functional.camera import crop_camera, resize_affine
+from pipeline.functional.resample import resample
+from pipeline.functional.rigid import rigid
 from pipeline.graph.context import Context, stacked
 from pipeline.graph.rates import work_of
 from pipeline.graph.work import Advance, Work
 from pipeline.items.features import TemplateCells
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.route import TemplateView
+from pipeline.stages.crop import HALF
 from pipeline.stages.fit import Fit, Fitted, chain, foreground_cells
 from pipeline.store import Layout, Ref, make_ref
 
 VIEWS_PER_BATCH = 8
 CROPS_PER_BATCH = 50
+DRAWN_LARGER = 2  # a second look's picture, a side, than the crop that is made of it
+
+Pose = Float[np.ndarray, "4 4"]
+Matrix = Float[np.ndarray, "3 3"]
 
 
 @dataclass(eq=False)
@@ -31,6 +40,7 @@ class StoredBank:
     maps: Callable[[], torch.Tensor]
     masks: Callable[[], torch.Tensor]
     view: Callable[[int], TemplateView]
+    draw: Callable[[Pose, Matrix, Matrix], TemplateView]
     poses: Callable[[], np.ndarray]
     fitted: Callable[[Fit], Fitted]
 
@@ -252,6 +262,23 @@ class TemplateNodes:
             maps=lambda: self.run.tensor(features[self.run.stages.match.layer].array("maps")),
             masks=lambda: self.run.tensor(crops.array("mask")),
             view=view,
+            draw=partial(self._drawn, obj_id),
             poses=lambda: templates.array("T_cam_obj"),
             fitted=fitted,
         )
+
+    def _drawn(self, obj_id: int, T_cam_obj: Pose, A_crop_img: Matrix, K: Matrix) -> TemplateView:
+        """The object in a pose as a query's crop shows it: drawn twice as large, shrunk as templates are."""
+        stages, size = self.run.stages, self.run.stages.crop.size
+        K_crop, R_crop_cam = crop_camera(A_crop_img, K)
+        A_drawn_crop = resize_affine(float(DRAWN_LARGER))
+        K_drawn, T_drawn_obj = A_drawn_crop @ K_crop, rigid(R_crop_cam, np.zeros(3)) @ T_cam_obj
+        size_hw = (DRAWN_LARGER * size,) * 2
+        rgb, depth_mm = stages.render.render(self.run.model(obj_id).mesh, K_drawn, T_drawn_obj[None], size_hw)
+        A_crop_drawn = np.linalg.inv(A_drawn_crop)
+        crop = np.rint(resample(rgb[0], A_crop_drawn, size=size)).clip(0, 255).astype(np.uint8)
+        mask = resample(depth_mm[0] > 0, A_crop_drawn, size=size) >= HALF
+        geometry = Geometry([depth_mm[0]], K_drawn[None], T_drawn_obj[None])
+        crops = Crops(crop[None], mask[None], A_crop_drawn[None], geometry)
+        features = {layer: self.run.tensor(maps[0]) for layer, maps in self.run.maps(crops, stages.layers).items()}
+        return TemplateView(features, self.run.tensor(mask), A_crop_drawn, depth_mm[0], K_drawn, T_drawn_obj, rgb=crop)

@@ -1,0 +1,138 @@
+"""A hypothesis drawn at its own pose: where its picture says things are, and what another match makes of the pose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.bop.dataset import Dataset, open_dataset
+from pipeline.functional import camera, rigid
+from pipeline.functional.masks import foreground
+from pipeline.graph import Context, Graph
+from pipeline.items.poses import PoseEstimate
+from pipeline.route import Stages, trace_pose
+from pipeline.spec import Runtime
+from pipeline.stages.choose.agreement import Agreement
+from pipeline.stages.cluster.one import One
+from pipeline.stages.correspond.cosine import Cosine as Corresponder
+from pipeline.stages.crop.square import Square
+from pipeline.stages.crop.virtual import Virtual
+from pipeline.stages.detect.gt_mask import GtMask
+from pipeline.stages.extract.hog import Hog
+from pipeline.stages.fuse.concat import Concat
+from pipeline.stages.lift import lift
+from pipeline.stages.match.masked_cosine import MaskedCosine
+from pipeline.stages.refine.featuremetric import Featuremetric
+from pipeline.stages.render.pyrender import Pyrender
+from pipeline.stages.render.raycast import Raycast
+from pipeline.stages.solve.epnp import Epnp
+from pipeline.store import LocalStoreConfig, Store
+from pipeline.synthetic.scenes import write_dataset
+
+STAGES = Stages(
+    render=Raycast(viewpoints="superfibonacci", count=100),
+    extract=Hog(),
+    crop=Square(),
+    match=MaskedCosine(top_k=3),
+    fuse=Concat(layers=(8, 11)),
+    cluster=One(),
+    correspond=Corresponder(),
+    solve=Epnp(),
+    choose=Agreement(),
+    refine=Featuremetric(),
+    detect=GtMask(),
+    second_look=2,
+)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> Dataset:
+    root = tmp_path_factory.mktemp("second_look") / "scenes"
+    write_dataset(root, objects=2, images=6, per_image=2, occluded=0.3, seed=5, progress=False)
+    return open_dataset(root, name="second_look")
+
+
+def graph(scenes: Dataset, cache, **changes: object) -> Graph:
+    stages = Stages(**{**vars(STAGES), **changes})
+    store = Store(LocalStoreConfig(root=str(cache)))
+    return Graph(Context(stages, scenes, scenes.targets, store, Runtime(progress=False, device="cpu")))
+
+
+def estimates(of: Graph) -> list[PoseEstimate]:
+    answers = of.estimate()
+    assert all(isinstance(answer, PoseEstimate) for answer in answers)
+    return answers  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("crop", [Square(), Virtual()], ids=["square", "virtual"])
+@pytest.mark.parametrize(
+    "render", [Raycast(), pytest.param(Pyrender(), marks=pytest.mark.gl)], ids=["raycast", "pyrender"]
+)
+def test_a_drawn_view_shows_the_object_where_the_querys_crop_would(scenes, cache, crop, render):
+    made = graph(scenes, cache, crop=crop, render=replace(render, viewpoints="superfibonacci", count=4))
+    made.onboard()
+    gt, K = scenes.ground_truth(*scenes.images[0])[0], scenes.K(*scenes.images[0])
+    px = camera.project(K, gt.T_cam_obj[:3, 3])
+    box = (*(px - 60), *(px + 60))
+    size = crop.size
+    square = camera.square_crop(box, size=size, padding_ratio=1.2)
+    A = square if isinstance(crop, Square) else camera.virtual_crop(box, K, size=size, padding_ratio=1.2)
+    drawn = made.templates.bank(gt.obj_id).draw(gt.T_cam_obj, A, K)
+    assert drawn.rgb.shape == (size, size, 3)
+    assert drawn.rgb[drawn.mask.numpy()].any(axis=1).mean() > 0.95
+    assert {layer: tuple(maps.shape) for layer, maps in drawn.features.items()} == {
+        layer: made.run.stages.extract.feature_shape(layer) for layer in made.run.stages.layers
+    }
+    crop_px = camera.grid_xy(foreground(drawn.mask), width=size).double().numpy()
+    points = lift(crop_px, drawn.A_crop_img, drawn.depth_mm, drawn.K, drawn.T_cam_obj)
+    seen = np.isfinite(points).all(1)
+    assert seen.mean() > 0.8  # the rest lies across the outline, where depth is of two surfaces
+    shown = camera.apply(A, camera.project(K, rigid.transform(gt.T_cam_obj, points[seen])))
+    np.testing.assert_allclose(shown, crop_px[seen], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes, cache):
+    errors = {}
+    for looks in (0, 2):
+        made = graph(scenes, cache, second_look=looks)
+        answers, off = estimates(made), []
+        for answer in answers:
+            (true,) = [g for g in scenes.ground_truth(answer.scene_id, answer.im_id) if g.gt_id == answer.gt_id]
+            points = made.run.model(answer.obj_id).mesh.vertices
+            moved = rigid.transform(answer.T_cam_obj, points) - rigid.transform(true.T_cam_obj, points)
+            off.append(np.linalg.norm(moved, axis=1).mean() / np.ptp(points, axis=0).max())
+            assert ("draw" in answer.times_s) == (looks > 0)
+        errors[looks] = float(np.median(off))
+        traced = made.retracer()(answers[0])
+        assert traced is not None
+        np.testing.assert_array_equal(traced.hypothesis.solution.T_cam_obj, answers[0].T_cam_obj)
+        assert (traced.hypothesis.drawn is not None) == (looks > 0)
+    assert errors[2] < 0.8 * errors[0], errors
+
+
+def test_poses_without_a_second_look_keep_their_key_and_those_with_one_have_their_own(scenes, cache):
+    keys = {n: graph(scenes, cache, second_look=n).poses.run_ref().key for n in (0, 1, 2)}
+    assert len(set(keys.values())) == 3
+
+
+def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache):
+    made = graph(scenes, cache, second_look=1)
+    made.onboard()
+    found = made.queries.make_crops(scenes.images[0])
+    made.queries.make_features(scenes.images[0], found)
+    query, bank = made.poses.query(found[0])[0], made.templates.bank(found[0].detection.obj_id)
+    behind = rigid.rigid(np.eye(3), np.array([0.0, 0.0, -500.0]))
+    nothing = bank.draw(behind, query.A_crop_img, query.K)
+    assert not nothing.mask.any()
+    kept = trace_pose(made.run.stages, query, replace(bank, draw=lambda *pose: nothing)).best
+    first = trace_pose(replace(made.run.stages, second_look=0), query, bank).best
+    assert kept.drawn is None
+    np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)
+
+
+def test_a_plan_counts_the_passes_of_second_looks(scenes, cache):
+    made = graph(scenes, cache, second_look=3)
+    made.detect()
+    nodes = [node for node in made.plan() if node.step == "poses"]
+    assert sum(node.passes for node in nodes) == 3 * len(scenes.targets)
