@@ -14,6 +14,7 @@ from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
 from pipeline.metrics.recall import instance_recalls
 from pipeline.report.rows import Row, read_rows
+from pipeline.spec import digest
 
 TEST_SEED = 9041  # of synthetic.demo; training and validation objects have builders and seeds of their own
 DEMO = ("dataset=demo", f"dataset.seed={TEST_SEED}", "dataset.objects=20", "dataset.images=40", "dataset.per_image=5")
@@ -35,23 +36,30 @@ RECALLS = ("AR_VSD", "AR_MSSD", "AR_MSPD")  # in the order of metrics.recall.ins
 QUIET = ("gallery=0", "overlays=false", "evaluate.correspondences=true")
 
 
-def benchmark(folder: Path, *, lmo: Path | None = None, detections: Path | None = None) -> str:
-    """Tables in Markdown; every run is cached, an interrupted benchmark goes on where it stopped."""
+def benchmark(
+    folder: Path, *, lmo: Path | None = None, detections: Path | None = None, overrides: Sequence[str] = ()
+) -> str:
+    """Tables in Markdown; every run is cached, an interrupted benchmark goes on where it stopped.
+
+    ``overrides`` are those of ``python -m pipeline``, for every row alike.
+    """
     parts: dict[str, tuple[str, ...]] = {"objects of the test seed": (*DEMO, f"dataset.root={folder / 'data'}")}
     if lmo is not None:
         parts["LM-O, visible masks"] = ("dataset=lmo", f"dataset.root={lmo}", "evaluate.vsd=false")
         if detections is not None:
             found = ("detect=json", f"detect.path={detections}")
             parts["LM-O, detections"] = (*parts["LM-O, visible masks"], *found)
-    return "\n\n".join(_table(title, data, folder) for title, data in parts.items())
+    results = folder / "results" / digest(list(overrides))[:8] if overrides else folder / "results"
+    made = (_table(title, (*data, *overrides), results, folder / "cache") for title, data in parts.items())
+    return "\n\n".join(made)
 
 
-def _table(title: str, data: Sequence[str], folder: Path) -> str:
+def _table(title: str, data: Sequence[str], results: Path, cache: Path) -> str:
     """A row for each system: 95 % intervals over images in brackets, and by how much the first one leads."""
     rows = {}
     for name, choices in SYSTEMS.items():
-        out = folder / "results" / title.replace(",", "").replace(" ", "_") / name.replace(",", "").replace(" ", "_")
-        rows[name] = _run(["method=dzop_x", *data, *choices, *QUIET], out, folder / "cache")
+        out = results / title.replace(",", "").replace(" ", "_") / name.replace(",", "").replace(" ", "_")
+        rows[name] = _run(["method=dzop_x", *choices, *QUIET, *data], out, cache)
     recalls = [k for k, name in enumerate(RECALLS) if rows[OURS].metrics.get(name) is not None]
     heads = ["features", *TEMPLATES.values(), *(RECALLS[k] for k in recalls), "mean", f"lead of {OURS}"]
     lines = [f"**{title}**", "", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
@@ -96,8 +104,10 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("cache/benchmark"), help="data, cache and results")
     parser.add_argument("--lmo", type=Path, help="folder of LM-O, for the same table on photographs")
     parser.add_argument("--detections", type=Path, help="a detector's json for LM-O, for the table once more")
-    options = parser.parse_args()
-    print(benchmark(options.folder.resolve(), lmo=options.lmo, detections=options.detections))
+    parser.add_argument("overrides", nargs="*", help="for all runs alike, such as second_look=none")
+    options = parser.parse_intermixed_args()
+    folder, overrides = options.folder.resolve(), options.overrides
+    print(benchmark(folder, lmo=options.lmo, detections=options.detections, overrides=overrides))
 
 
 if __name__ == "__main__":

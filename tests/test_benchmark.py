@@ -37,6 +37,24 @@ def test_every_system_has_a_row_on_every_data_set_and_the_lead_is_paired(monkeyp
     assert f"dataset.seed={benchmark.TEST_SEED}" in asked[0][0]
 
 
+def test_overrides_are_of_every_row_and_have_results_of_their_own(monkeypatch, tmp_path):
+    asked = {}
+
+    def run(choices, out: Path, cache: Path):
+        asked[out] = choices
+        return row(correct=True)
+
+    monkeypatch.setattr(benchmark, "_run", run)
+    monkeypatch.setattr("sys.argv", ["benchmark", "--folder", str(tmp_path), "second_look=none", "threads=1"])
+    benchmark.main()
+    assert len(asked) == len(benchmark.SYSTEMS)
+    assert all(choices[-2:] == ["second_look=none", "threads=1"] for choices in asked.values())
+    plain = set(asked)
+    benchmark.benchmark(tmp_path)
+    assert plain.isdisjoint(set(asked) - plain)
+    assert len(asked) == 2 * len(benchmark.SYSTEMS)
+
+
 def test_recalls_of_vsd_are_a_column_where_they_are_known(monkeypatch, tmp_path):
     def run(*_):
         plain = row(correct=True)
