@@ -34,7 +34,7 @@ from pydantic.dataclasses import is_pydantic_dataclass
 from pipeline.cache_cli import cache_command
 from pipeline.checkpoints import NotFetched, offline
 from pipeline.errors import BadInput, DzopError
-from pipeline.route import Stages
+from pipeline.route import SecondLook, Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
 from pipeline.score_cli import lint_command, score_command
 from pipeline.spec import build
@@ -42,6 +42,9 @@ from pipeline.store import Store
 from pipeline.whole import write_whole
 
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
+OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method")
+NEEDED = (*STAGES, *OPTIONS, "second_look", "fallback", "dataset", "store", "runtime", "select", "evaluate")
+"""What config.yaml has, and ``~`` on the command line can take away."""
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
@@ -161,7 +164,7 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     except OmegaConfBaseException:  # a value that stands for another which is not there
         plain = OmegaConf.to_container(config, resolve=False)
     values = cast(dict[str, Any], _writable(plain))
-    note_failure(values["out"], values, overrides, message)
+    note_failure(values.get("out", "results"), values, overrides, message)
 
 
 def _writable(value: Any) -> Any:
@@ -176,6 +179,9 @@ def _writable(value: Any) -> Any:
 def _job(config: DictConfig, *, sweeping: bool) -> None:
     # one plain dict, so that nothing below knows OmegaConf
     values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    for name in NEEDED:
+        if name not in values:
+            raise BadInput(name, found="nothing", needed=f"a value: leave ~{name} out")
     if values["step"] == "report":
         if values["plan"]:
             raise BadInput("plan=true step=report", found="a step without a plan", needed="plan=false, or another step")
@@ -202,10 +208,8 @@ def stages_of(values: Mapping[str, Any]) -> Stages:
         chosen["fuse"] = chosen["fuse"].resolve_for(_model_of(chosen["extract"]))
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
-    looks = values["second_look"]["hypotheses"]
-    if not isinstance(looks, int) or isinstance(looks, bool) or looks < 0:
-        raise BadInput("second_look.hypotheses", found=repr(looks), needed="a whole number, 0 or more")
-    return Stages(**chosen, fallback=values["fallback"], second_look=looks)
+    looks: SecondLook = variant(values["second_look"], "second_look")
+    return Stages(**chosen, fallback=values["fallback"], second_look=looks.hypotheses)
 
 
 def _model_of(extract: Any) -> str:
@@ -217,7 +221,6 @@ def _model_of(extract: Any) -> str:
 
 def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:
     """What to run and where to write, from a configuration."""
-    names = ("step", "plan", "out", "overlays", "gallery", "threads", "method")
     made = {
         "sweep": values.get("sweep"),
         "select": build(Select, values["select"], where="select"),
@@ -226,7 +229,7 @@ def options_of(values: Mapping[str, Any], *, resume: bool = False) -> Options:
         "config": values,
         "resume": resume,
     }
-    return build(Options, {**{name: values[name] for name in names}, **made}, where="config")
+    return build(Options, {**{name: values[name] for name in OPTIONS}, **made}, where="config")
 
 
 def variant(values: Mapping[str, Any], where: str) -> Any:

@@ -27,6 +27,7 @@ from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
+from pipeline.spec import NonNegative, spec
 from pipeline.stages.choose import Chooser
 from pipeline.stages.cluster import Clusterer
 from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthCorresponder
@@ -46,12 +47,18 @@ ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "r
 """What a pose depends on beside the features."""
 
 
+@spec
+class SecondLook:
+    """How many of the worthiest hypotheses are drawn in their pose, and matched with that picture; 0: none."""
+
+    hypotheses: NonNegative = 0
+
+
 @dataclass(frozen=True)
 class Stages:
     """Which variant at each stage.
 
-    ``fallback``: a template's own pose may stand in for a failed solver. ``second_look``: that many of the worthiest
-    hypotheses are drawn at their pose, and matched with that picture in place of their template's; 0: none.
+    ``fallback``: a template's own pose may stand in for a failed solver. ``second_look``: hypotheses of SecondLook.
     """
 
     render: Renderer

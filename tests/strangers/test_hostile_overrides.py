@@ -85,7 +85,9 @@ def test_a_yaml_in_a_dataset_or_the_working_folder_is_not_read(capsys, monkeypat
     assert not trap.exists()
 
 
-@pytest.mark.parametrize("override", ["match=0", "match.layer=[[[", "match.layer=${x}", "=", "a=b", "match.layer='"])
+@pytest.mark.parametrize(
+    "override", ["match=0", "match.layer=[[[", "match.layer=${x}", "=", "a=b", "match.layer='", "~match", "~out"]
+)
 def test_a_broken_override_is_told_in_one_line(capsys, monkeypatch, chosen, tmp_path: Path, override: str):
     monkeypatch.chdir(tmp_path)
     ran = run_dzop(capsys, monkeypatch, *chosen, override)
@@ -117,6 +119,8 @@ KEYS += [
     "sweep",
     "cluster.count",
     "fallback",
+    "second_look",
+    "second_look.hypotheses",
 ]
 WORDS = [
     "0",
