@@ -11,8 +11,8 @@ class BadInput(DzopError):
     """A file, a field or an option that cannot be used."""
 
     def __init__(self, where: object, *, found: object, needed: str) -> None:
-        self.where, self.found, self.needed = _line(where), _line(found), needed
-        super().__init__(f"{self.where}: found {self.found}, needs {needed}")
+        self.where, self.found, self.needed = _line(where), _line(found), _line(needed, 2000)
+        super().__init__(f"{self.where}: found {self.found}, needs {self.needed}")
 
 
 def _line(value: object, length: int = 400) -> str:
