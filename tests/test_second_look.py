@@ -111,7 +111,7 @@ def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes,
     assert errors[2] < 0.8 * errors[0], errors
 
 
-def test_poses_without_a_second_look_keep_their_key_and_those_with_one_have_their_own(scenes, cache):
+def test_poses_of_another_number_of_looks_have_keys_of_their_own(scenes, cache):
     keys = {n: graph(scenes, cache, second_look=n).poses.run_ref().key for n in (0, 1, 2)}
     assert len(set(keys.values())) == 3
 
