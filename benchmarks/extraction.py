@@ -13,6 +13,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract.diffusion import DiffusionBackbone, DiffusionFeatures
 from pipeline.stages.extract.embedded import Embedded
+from pipeline.stages.extract.exact import exact_convolutions
 from pipeline.stages.extract.random_sd import RandomSD
 
 LAYERS = (2, 5, 8, 11)
@@ -59,7 +60,7 @@ def _extraction(name: str, spec: DiffusionFeatures, *, device: str, repeats: int
 
 @torch.inference_mode()
 def _bare(backbone: DiffusionBackbone, images: int) -> None:
-    """Encoder and U-Net, up to the block that the deepest layer is read before, on noise of the right shape."""
+    """Encoder and U-Net, up to the block that the deepest layer is read before, in the same maths."""
     model, spec = backbone.model, backbone.spec
     like: dict[str, Any] = {"device": model.prompt.device, "dtype": model.prompt.dtype}
     vae: Any = model.vae
@@ -69,8 +70,9 @@ def _bare(backbone: DiffusionBackbone, images: int) -> None:
     stop = deepest.register_forward_pre_hook(_reached)
     try:
         for _ in range(0, images, step):
-            latent = vae.encode(torch.zeros(step, 3, spec.input_size, spec.input_size, **like)).latent_dist.mean
-            with contextlib.suppress(_Reached):
+            with exact_convolutions():
+                latent = vae.encode(torch.zeros(step, 3, spec.input_size, spec.input_size, **like)).latent_dist.mean
+            with exact_convolutions(), contextlib.suppress(_Reached):
                 unet(latent, torch.tensor(spec.timestep), model.prompt.expand(step, -1, -1))
     finally:
         stop.remove()

@@ -46,6 +46,12 @@ class Bank:
         """Everything about one template."""
         return self.views[index]
 
+    def draw(
+        self, T_cam_obj: Float[np.ndarray, "4 4"], A_crop_img: Float[np.ndarray, "3 3"], K: Float[np.ndarray, "3 3"]
+    ) -> TemplateView:
+        """Nothing is drawn here."""
+        raise NotImplementedError
+
     def fitted(self, fit: Fit) -> Fitted:
         """Nothing is fitted here."""
         raise NotImplementedError(fit.kind)

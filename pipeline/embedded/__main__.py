@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
+from joblib import Parallel, delayed
 
 from pipeline.embedded.export import export
 from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
@@ -20,7 +22,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m pipeline.embedded", description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path("cache/embedded"), help="shards, checkpoints, loss curves")
     parser.add_argument("--minutes", type=float, default=120.0, help="stop after so long; the next call goes on")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the number of steps: more on a faster machine")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the number of steps")
+    parser.add_argument("--batch", type=float, default=1.0, help="of the size of batches: less on a slower machine")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw batches; 0 = this one alone")
     parser.add_argument("--threads", type=int, default=0, help="0 = all cores")
     run(parser.parse_args())
 
@@ -29,15 +34,25 @@ def run(options: argparse.Namespace) -> None:
     """Shards first as far as the first steps need them, then each stage; weights are replaced once all have ended."""
     if options.threads:
         torch.set_num_threads(options.threads)
-    until, place, plan = time.time() + 60 * options.minutes, Place(options.folder), Plan()
-    for index in range(8):
-        make_shard(place.folder / "shards", index)
+    until, place, plan = time.time() + 60 * options.minutes, Place(options.folder), _sized(Plan(), options.batch)
+    _make_shards(place.folder / "shards", plan.shards if options.workers else 8, options.workers)
     for kind, steps in ((Autoencoder, plan.autoencoder), (Denoiser, plan.denoiser), (Descriptors, plan.descriptors)):
-        if not train(kind(plan, place, round(steps * options.scale)), place, until=until):
+        stage = kind(plan, place, round(steps * options.scale), options.device)
+        if not train(stage, place, until=until, workers=options.workers):
             print(f"{kind.name}: time is up; the next call goes on from here, {WEIGHTS} stays as it is")
             return
-        print(f"{kind.name}: done")
+        print(f"{kind.name}: done", flush=True)
     print(f"{export(place, WEIGHTS) / 1e6:.1f} MB of weights in {WEIGHTS}")
+
+
+def _make_shards(folder: Path, count: int, workers: int) -> None:
+    """The first shards, or with workers all of them before any is read."""
+    Parallel(n_jobs=max(workers, 1))(delayed(make_shard)(folder, index) for index in range(count))
+
+
+def _sized(plan: Plan, batch: float) -> Plan:
+    pictures, objects = max(round(batch * plan.pictures), 1), max(round(batch * plan.objects), 1)
+    return replace(plan, pictures=pictures, objects=objects)
 
 
 if __name__ == "__main__":

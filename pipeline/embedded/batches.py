@@ -5,7 +5,7 @@ Nothing is kept between steps: a batch depends on seed and step alone, so a resu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from pipeline.embedded.dressing import dressed
+from pipeline.embedded.dressing import dressed, scanned
 from pipeline.embedded.pictures import Picture, View, photograph, template
 from pipeline.embedded.views import (
     CLUSTERS_PER_OBJECT,
@@ -29,6 +29,7 @@ from pipeline.synthetic.parts import Rng
 
 CELLS = 64  # a side, of descriptors
 QUERIES, TEMPLATES = 2, VIEWS - 1  # of a cluster
+_SCANS = 0.6  # of the objects, where they are hard, differ from their mesh
 _POINTS = 48  # correspondences of a pair at most
 _TOLERANCE = 0.03  # of the object's radius: a point this far behind what a template shows there is hidden in it
 
@@ -73,6 +74,10 @@ class PairBatch:
     matched: Bool[Tensor, "b c q t m"]
     angle_deg: Float[Tensor, "b c q ct"]
 
+    def on(self, device: torch.device) -> PairBatch:
+        """The same on another device."""
+        return PairBatch(*(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)))
+
 
 def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n S S 3"]:
     """Pictures of all sorts, each of another object: two in three are photographs."""
@@ -85,15 +90,17 @@ def picture_batch(source: Source, step: int, *, count: int) -> UInt8[Tensor, "n 
 def pair_batch(source: Source, step: int, *, count: int, hard: bool = True) -> PairBatch:
     """Two photographs of the query's view of every cluster of ``count`` objects, and its other views as templates.
 
-    ``hard``: with surfaces of their own (dressing), other objects in front of them, shadows and worse masks.
+    ``hard``: with surfaces of their own (dressing), meshes that are not quite like them, other objects in front of
+    them, shadows and worse masks.
     """
     objects, rng = source.objects(step, count, dress=hard)
     pictures: list[Picture] = []
     parts, angles = [], []
     for clusters, others in zip(objects, objects[1:] + objects[:1], strict=True):
-        for views in clusters:
+        meshes = scanned(clusters, rng) if hard and rng.uniform() < _SCANS else clusters
+        for views, drawn in zip(clusters, meshes, strict=True):
             queries = [photograph(views[0], rng, other=_any(others, rng) if hard else None) for _ in range(QUERIES)]
-            pictures += queries + [template(view, rng) for view in views[1:]]
+            pictures += queries + [template(view, rng) for view in drawn[1:]]
             parts += [_correspondences(q, views[0], t, rng) for q in queries for t in views[1:]]
         R_template = _rotations([view for views in clusters for view in views[1:]])
         for views in clusters:
@@ -120,7 +127,7 @@ def _rotations(views: list[View]) -> Float[np.ndarray, "n 3 3"]:
     return np.stack([view.T[:3, :3] for view in views]).astype(np.float64)
 
 
-@lru_cache(maxsize=200)
+@lru_cache(maxsize=1000)
 def _shard(folder: Path, index: int, validation: bool) -> Views:
     return read_shard(make_shard(folder, index, validation=validation))
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, Int64
 
 from pipeline.embedded.pictures import View
 from pipeline.synthetic.parts import Rng, random_direction
@@ -18,6 +19,47 @@ from pipeline.synthetic.parts import Rng, random_direction
 Points = Float[np.ndarray, "m 3"]
 Values = Float[np.ndarray, " m"]
 _WAVES = 5
+
+
+def scanned(clusters: list[list[View]], rng: Rng) -> list[list[View]]:
+    """All views of one object as its mesh would show it: another camera's colours and light baked in, softer, or bare.
+
+    Meshes come from scanners or from drawings; what a photograph shows differs in colour, sharpness and relief.
+    """
+    bare = rng.uniform(70, 220) if rng.uniform() < 0.15 else None
+    toward, strength = random_direction(rng), rng.choice([0.0, rng.uniform(0.2, 0.8)])
+    stains, depth = _waves(rng, fastest=rng.uniform(2, 25)), rng.choice([0.0, rng.uniform(0.05, 0.25)])
+    saturation, gain, gamma = rng.uniform(0.3, 1.4), rng.uniform(0.7, 1.3, 3), np.exp(rng.uniform(-0.4, 0.4))
+    blur, smooth = (rng.choice([0.0, rng.uniform(0.5, 2.5)]) for _ in range(2))
+
+    def mesh(view: View) -> View:
+        mask = view.mask
+        y, x = np.nonzero(mask)
+        normal = _softened(view.normal, mask, smooth)
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+        if bare is not None:
+            return replace(view, albedo=np.where(mask[..., None], np.uint8(bare), view.albedo), normal=normal)
+        colour = _softened(view.albedo.astype(np.float32), mask, blur)[y, x] / 255
+        grey = colour.mean(-1, keepdims=True)
+        light = 1 - strength + strength * np.maximum(view.normal[y, x] @ (view.T[:3, :3] @ toward), 0)
+        light = light * (1 + depth * _sum(stains, _points(view, y, x)))
+        colour = np.clip(grey + saturation * (colour - grey), 0, 1) ** gamma * gain * light[:, None]
+        albedo = view.albedo.copy()
+        albedo[y, x] = np.clip(255 * colour, 0, 255)
+        return replace(view, albedo=albedo, normal=normal)
+
+    return [[mesh(view) for view in views] for views in clusters]
+
+
+def _softened(
+    values: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"], sigma: float
+) -> Float32[np.ndarray, "S S 3"]:
+    """Gaussian means over the pixels inside the mask."""
+    if not sigma:
+        return values
+    inside = mask.astype(np.float32)
+    weight = np.maximum(cv2.GaussianBlur(inside, (0, 0), sigma), 1e-3)
+    return np.asarray(cv2.GaussianBlur(values * inside[..., None], (0, 0), sigma)) / weight[..., None]
 
 
 def dressed(clusters: list[list[View]], rng: Rng) -> list[list[View]]:
@@ -33,10 +75,7 @@ Coat = Callable[[Points], tuple[Bool[np.ndarray, " m"], Float[np.ndarray, " 3"]]
 def _dressed(view: View, coats: list[Coat], relief: Callable[[Points], Points] | None) -> View:
     mask = view.mask
     y, x = np.nonzero(mask)
-    T, K = view.T.astype(np.float64), view.K.astype(np.float64)
-    z = view.depth[y, x] + T[2, 3]
-    in_camera = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=-1)
-    points = (in_camera - T[:3, 3]) @ T[:3, :3]
+    points = _points(view, y, x)
     albedo, normal = view.albedo.copy(), view.normal
     for coat in coats:
         covered, colour = coat(points)
@@ -44,10 +83,18 @@ def _dressed(view: View, coats: list[Coat], relief: Callable[[Points], Points] |
     if relief is not None:
         normal = normal.copy()
         upright = normal[y, x]
-        slope = (relief(points) @ T[:3, :3].T).astype(np.float32)
+        slope = (relief(points) @ view.T[:3, :3].T).astype(np.float32)
         tilted = upright - slope + (slope * upright).sum(-1, keepdims=True) * upright
         normal[y, x] = tilted / np.maximum(np.linalg.norm(tilted, axis=-1, keepdims=True), 1e-6)
     return replace(view, albedo=albedo, normal=normal)
+
+
+def _points(view: View, y: Int64[np.ndarray, " m"], x: Int64[np.ndarray, " m"]) -> Points:
+    """Object points of pixels."""
+    T, K = view.T.astype(np.float64), view.K.astype(np.float64)
+    z = view.depth[y, x] + T[2, 3]
+    in_camera = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=-1)
+    return (in_camera - T[:3, 3]) @ T[:3, :3]
 
 
 def _coat(rng: Rng) -> Coat:

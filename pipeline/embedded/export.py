@@ -48,12 +48,12 @@ def _curve(place: Place, stage: str) -> list[dict[str, float]]:
     records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     kept = [record for record in records if record["step"] < 20 or record["step"] % 25 == 0] + records[-1:]
     by_step = {record["step"]: record for record in kept}  # steps after a checkpoint that was gone back to come twice
-    return [{name: value for name, value in record.items() if name != "time_s"} for record in by_step.values()]
+    return [{name: value for name, value in record.items() if name != "at"} for record in by_step.values()]
 
 
 def _saved(place: Place, stage: str) -> dict[str, Any] | None:
     path = place.checkpoint(stage)
-    return torch.load(path, weights_only=True) if path.exists() else None
+    return torch.load(path, map_location="cpu", weights_only=True) if path.exists() else None
 
 
 def _below(prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ from pipeline.embedded.batches import CELLS, PairBatch
 from pipeline.functional.masks import cell_mask
 
 _NEAR_DEG = 12.0  # templates about this far off are half as good as the query's own view
-_MATCHED_DEG = 20.0  # poses are solved from templates about this near: others teach little
+_MATCHED_DEG = 25.0  # poses are solved from templates about this near: others teach little
 
 
 def reconstruction_loss(
@@ -73,7 +73,7 @@ def _bilinear(xy: Float[Tensor, "*n 2"]) -> tuple[Int64[Tensor, "*n 4"], Float[T
     xy = xy.clamp(0, CELLS - 1.001)
     low = xy.floor()
     part = xy - low
-    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], device=xy.device)
     weight = (1 - corners - part[..., None, :]).abs().prod(-1)
     return _index(low[..., None, :] + corners), weight
 

@@ -7,16 +7,21 @@ import json
 import math
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import cv2
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torch.utils.data import DataLoader, Dataset
 
 from pipeline.embedded import losses
-from pipeline.embedded.batches import Source, pair_batch, picture_batch
+from pipeline.embedded.batches import CELLS, PairBatch, Source, pair_batch, picture_batch
 from pipeline.functional.aggregation import Aggregation
+from pipeline.functional.gradients import edge_histograms, with_edges
 from pipeline.stages.extract.decoder import decoder_maps, map_shape
 from pipeline.stages.extract.diffusion import clean_latent, network_image
 from pipeline.stages.extract.embedded import PROMPT, untrained
@@ -45,17 +50,25 @@ VAE: dict[str, Any] = {
     "up_block_types": ("UpDecoderBlock2D",) * 3,
 }
 _EMA, _WARMUP = 0.998, 50
+_EDGES = 1.5  # weight of gradient histograms beside descriptors: fuse.learned
+_NOTED = 25  # steps between two waits for the device
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How many steps each stage takes, and what of; the first ``easy`` of the descriptors are on easier pictures."""
+    """How many steps each stage takes, and what of; the first ``easy`` of the descriptors are on easier pictures.
 
-    shards: int = 150
-    autoencoder: int = 500
-    denoiser: int = 400
-    descriptors: int = 5300
-    easy: int = 2700
+    A batch has ``pictures``, each with ``noises`` of them, or ``objects`` with all their clusters of views.
+    """
+
+    shards: int = 300
+    autoencoder: int = 1200
+    denoiser: int = 1500
+    descriptors: int = 5600
+    easy: int = 800
+    pictures: int = 64
+    noises: int = 4
+    objects: int = 8
     seed: int = 0
 
 
@@ -81,16 +94,17 @@ class Place:
 
 
 class Stage(ABC):
-    """One network with its optimiser. ``loss(step)`` draws its own batch; everything random depends on the step."""
+    """One network with its optimiser. ``batch(step)`` draws on the CPU; everything random depends on the step."""
 
-    name: str
-    rate: float
-    decay = 1e-2
+    name: ClassVar[str]
+    rate: ClassVar[float]
+    decay: ClassVar[float] = 1e-2
 
-    def __init__(self, plan: Plan, place: Place, steps: int) -> None:
+    def __init__(self, plan: Plan, place: Place, steps: int, device: str = "cpu") -> None:
         self.plan, self.steps, self.source = plan, steps, place.source(plan)
+        self.device = torch.device(device)
         torch.manual_seed(plan.seed)
-        self.model = self.build(place).to(memory_format=torch.channels_last)
+        self.model = self.build(place).to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
 
     @abstractmethod
@@ -98,7 +112,11 @@ class Stage(ABC):
         """The network, freshly initialised or as an earlier stage left it."""
 
     @abstractmethod
-    def loss(self, step: int) -> dict[str, Tensor]:
+    def batch(self, step: int) -> Any:
+        """What a step learns from, on the CPU."""
+
+    @abstractmethod
+    def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         """Terms to be added up."""
 
     def rate_at(self, step: int) -> float:
@@ -108,10 +126,8 @@ class Stage(ABC):
 
     def follow(self, step: int) -> None:
         """Move the average towards the model; slowly, once there is something to remember."""
-        keep = min(_EMA, (1 + step) / (10 + step))
-        with torch.no_grad():
-            for slow, fast in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
-                slow.lerp_(fast, 1 - keep) if slow.is_floating_point() else slow.copy_(fast)
+        follow = get_ema_multi_avg_fn(min(_EMA, (1 + step) / (10 + step)))
+        follow(list(self.average.parameters()), list(self.model.parameters()), step)
 
 
 class Autoencoder(Stage):
@@ -123,10 +139,14 @@ class Autoencoder(Stage):
         """From nothing."""
         return untrained(UNET, VAE)[1]
 
-    def loss(self, step: int) -> dict[str, Tensor]:
-        """Reconstruction of 16 pictures."""
-        image = network_image(picture_batch(self.source, step, count=16), size=128)
-        with _mixed():
+    def batch(self, step: int) -> Tensor:
+        """Pictures."""
+        return picture_batch(self.source, step, count=self.plan.pictures)
+
+    def loss(self, batch: Tensor, step: int) -> dict[str, Tensor]:
+        """Reconstruction."""
+        image = network_image(batch.to(self.device), size=128)
+        with _mixed(self.device):
             posterior = self.model.encode(image).latent_dist
             generator = torch.Generator().manual_seed(step)
             made = self.model.decode(posterior.sample(generator)).sample
@@ -142,19 +162,24 @@ class Denoiser(Stage):
 
     def build(self, place: Place) -> Any:
         """From nothing, on the latents of the autoencoder."""
-        self.encode = Latents(place)
-        self.alphas = torch.from_numpy(alphas_cumprod({})).float()
+        self.encode = Latents(place, self.device)
+        self.alphas = torch.from_numpy(alphas_cumprod({})).float().to(self.device)
         return untrained(UNET, VAE)[0]
 
-    def loss(self, step: int) -> dict[str, Tensor]:
-        """Squared error of the noise of 32 pictures at any timesteps (Ho et al., NeurIPS 2020, Eq. 14)."""
-        latent = self.encode(picture_batch(self.source, step, count=32))
+    def batch(self, step: int) -> Tensor:
+        """Pictures."""
+        return picture_batch(self.source, step, count=self.plan.pictures)
+
+    def loss(self, batch: Tensor, step: int) -> dict[str, Tensor]:
+        """Squared error of the noise at any timesteps (Ho et al., NeurIPS 2020, Eq. 14)."""
+        latent = self.encode(batch.to(self.device)).repeat(self.plan.noises, 1, 1, 1)
         generator = torch.Generator().manual_seed(step)
-        noise = torch.randn(latent.shape, generator=generator)
-        timestep = torch.randint(len(self.alphas), (len(latent),), generator=generator)
+        noise = torch.randn(latent.shape, generator=generator).to(self.device)
+        timestep = torch.randint(len(self.alphas), (len(latent),), generator=generator).to(self.device)
         kept = self.alphas[timestep][:, None, None, None]
-        with _mixed():
-            made = self.model(kept.sqrt() * latent + (1 - kept).sqrt() * noise, timestep, prompt(len(latent))).sample
+        with _mixed(self.device):
+            noisy = kept.sqrt() * latent + (1 - kept).sqrt() * noise
+            made = self.model(noisy, timestep, prompt(len(latent), self.device)).sample
         return {"loss": (made.float() - noise).square().mean()}
 
 
@@ -165,41 +190,48 @@ class Descriptors(Stage):
 
     def build(self, place: Place) -> Any:
         """On from the denoiser's average."""
-        self.encode = Latents(place)
+        self.encode = Latents(place, self.device)
         unet = untrained(UNET, VAE)[0]
-        unet.load_state_dict(torch.load(place.checkpoint("denoiser"), weights_only=True)["average"])
+        unet.load_state_dict(_loaded(place.checkpoint("denoiser"), self.device)["average"])
         return Described(unet)
 
-    def loss(self, step: int) -> dict[str, Tensor]:
-        """Both losses of 2 objects' 2 clusters of 8 pictures."""
-        batch = pair_batch(self.source, step, count=2, hard=step >= self.plan.easy)
+    def batch(self, step: int) -> PairBatch:
+        """Objects' clusters."""
+        return pair_batch(self.source, step, count=self.plan.objects, hard=step >= self.plan.easy)
+
+    def loss(self, batch: PairBatch, step: int) -> dict[str, Tensor]:
+        """Correspondences of descriptors, alone and with edges beside them, and retrieval."""
+        batch = batch.on(self.device)
         return described_losses(self.model, self.encode(batch.rgb), batch)
 
 
 class Described(nn.Module):
-    """A U-Net, the head over its maps, and the sharpness of both comparisons."""
+    """A U-Net, the head over its maps, and the sharpness of the comparisons."""
 
     def __init__(self, unet: nn.Module) -> None:
         super().__init__()
         self.unet = unet
         self.head = Aggregation({k: map_shape(UNET, layer=k, hook="pre", latent_size=32)[0] for k in LAYERS}, DIM)
-        self.log_scale = nn.Parameter(torch.tensor([math.log(15.0), math.log(20.0)]))
+        self.log_scale = nn.Parameter(torch.tensor([15.0, 20.0, 20.0]).log())
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Descriptors, and the maps that templates are chosen by."""
-        with _mixed():
-            maps = decoder_maps(self.unet, latent, TIMESTEP, prompt(1), layers=LAYERS, hook="pre")
+        with _mixed(latent.device):
+            known = prompt(1, latent.device)
+            maps = decoder_maps(self.unet, latent, TIMESTEP, known, layers=LAYERS, hook="pre")
             maps = {k: m.float() for k, m in maps.items()}
             return self.head(maps), maps[MATCH_LAYER]
 
 
-def described_losses(model: Described, latent: Tensor, batch: Any) -> dict[str, Tensor]:
-    """Correspondence and retrieval loss of a batch."""
+def described_losses(model: Described, latent: Tensor, batch: PairBatch) -> dict[str, Tensor]:
+    """Correspondence and retrieval losses of a batch."""
     descriptors, coarse = model(latent)
     scale = model.log_scale.clamp(max=math.log(60.0)).exp()
+    whole = with_edges(descriptors, edge_histograms(batch.rgb, batch.mask, cells=CELLS), weight=_EDGES)
     scores = losses.retrieval_scores(coarse, batch)
     return {
         "correspondence": losses.correspondence_loss(descriptors, batch, scale[0]),
+        "with_edges": losses.correspondence_loss(whole, batch, scale[2]),
         "retrieval": losses.retrieval_loss(scores, batch.angle_deg, scale[1]),
     }
 
@@ -207,9 +239,9 @@ def described_losses(model: Described, latent: Tensor, batch: Any) -> dict[str, 
 class Latents:
     """Pictures -> latents of unit variance, by the autoencoder as trained so far."""
 
-    def __init__(self, place: Place) -> None:
-        saved = torch.load(place.checkpoint("autoencoder"), weights_only=True)
-        self.vae = untrained(UNET, VAE)[1].to(memory_format=torch.channels_last)
+    def __init__(self, place: Place, device: torch.device) -> None:
+        saved = _loaded(place.checkpoint("autoencoder"), device)
+        self.vae = untrained(UNET, VAE)[1].to(device, memory_format=torch.channels_last)
         self.vae.load_state_dict(saved["average"])
         self.vae.eval().requires_grad_(False)
         self.config = VAE | {"scaling_factor": saved["scaling_factor"]}
@@ -217,53 +249,90 @@ class Latents:
     @torch.no_grad()
     def __call__(self, rgb: Tensor) -> Tensor:
         """Clean latents."""
-        with _mixed():
+        with _mixed(rgb.device):
             latent = clean_latent(self.vae, self.config, network_image(rgb, size=128))
         return latent.float().contiguous(memory_format=torch.channels_last)
 
 
-def prompt(count: int) -> Tensor:
+def prompt(count: int, device: torch.device) -> Tensor:
     """The text that the model does not know."""
-    return torch.zeros(PROMPT).expand(count, -1, -1)
+    return torch.zeros(PROMPT, device=device).expand(count, -1, -1)
 
 
-def train(stage: Stage, place: Place, *, until: float, save_every_s: float = 90.0) -> bool:
+class _Batches(Dataset[Any]):
+    """A stage's batches by step, for a loader's workers."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+
+    def __getitem__(self, step: int) -> Any:
+        return self.stage.batch(step)
+
+
+def batches(stage: Stage, first: int, workers: int) -> Iterator[Any]:
+    """Batches from step ``first`` on, in order, whoever drew them; without workers they are drawn here."""
+    steps: Any = range(first, stage.steps)
+    if not workers:
+        return map(stage.batch, steps)
+    drawn = DataLoader(
+        _Batches(stage),
+        batch_size=None,
+        sampler=steps,
+        num_workers=workers,
+        multiprocessing_context="fork",
+        worker_init_fn=lambda _: cv2.setNumThreads(0),
+    )
+    return iter(drawn)
+
+
+def train(stage: Stage, place: Place, *, until: float, save_every_s: float = 90.0, workers: int = 0) -> bool:
     """Run a stage to its end or to the time ``until``, from its last checkpoint on. Returns whether it ended."""
     optimiser = torch.optim.AdamW(stage.model.parameters(), lr=stage.rate, weight_decay=stage.decay, betas=(0.9, 0.98))
     step = _resumed(stage, optimiser, place)
     saved_at = time.monotonic()
-    while step < stage.steps and time.time() < until:
-        started = time.monotonic()
+    records: list[dict[str, Any]] = []
+    for batch in batches(stage, step, workers):
+        if time.time() >= until:
+            break
         for group in optimiser.param_groups:
             group["lr"] = stage.rate_at(step)
-        terms = stage.loss(step)
+        terms = stage.loss(batch, step)
         optimiser.zero_grad()
-        sum(terms.values(), torch.zeros(())).backward()
+        torch.stack(list(terms.values())).sum().backward()
         norm = nn.utils.clip_grad_norm_(stage.model.parameters(), 1.0)
         optimiser.step()
         stage.follow(step)
-        record = {name: round(float(value.detach()), 5) for name, value in terms.items()} | {
-            "norm": round(float(norm), 3)
-        }
-        _note(place, stage, {"step": step, **record, "time_s": round(time.monotonic() - started, 3)})
+        records.append({"step": step, **{name: value.detach() for name, value in terms.items()}, "norm": norm})
         step += 1
+        if len(records) >= _NOTED or stage.device.type == "cpu":
+            _note(place, stage, records)
         if time.monotonic() - saved_at > save_every_s:
             _save(stage, optimiser, step, place)
             saved_at = time.monotonic()
+    _note(place, stage, records)
     _save(stage, optimiser, step, place)
     return step >= stage.steps
 
 
-def _note(place: Place, stage: Stage, record: dict[str, float]) -> None:
+def _note(place: Place, stage: Stage, records: list[dict[str, Any]]) -> None:
+    """Append losses to the curve, and forget them."""
     with place.curve(stage.name).open("a") as curve:
-        curve.write(json.dumps(record) + "\n")
+        for record in records:
+            step = int(record.pop("step"))
+            values = {name: round(float(value), 5) for name, value in record.items()}
+            curve.write(json.dumps({"step": step, **values, "at": round(time.time(), 2)}) + "\n")
+    records.clear()
+
+
+def _loaded(path: Path, device: torch.device) -> dict[str, Any]:
+    return dict(torch.load(path, map_location=device, weights_only=True))
 
 
 def _resumed(stage: Stage, optimiser: torch.optim.Optimizer, place: Place) -> int:
     path = place.checkpoint(stage.name)
     if not path.exists():
         return 0
-    saved = torch.load(path, weights_only=True)
+    saved = _loaded(path, stage.device)
     stage.model.load_state_dict(saved["model"])
     stage.average.load_state_dict(saved["average"])
     optimiser.load_state_dict(saved["optimiser"])
@@ -284,9 +353,9 @@ def _save(stage: Stage, optimiser: torch.optim.Optimizer, step: int, place: Plac
 @torch.no_grad()
 def _scaling(stage: Autoencoder) -> float:
     """One over the standard deviation of latents (Rombach et al., CVPR 2022, App. G)."""
-    image = network_image(picture_batch(stage.source, 0, count=32), size=128)
+    image = network_image(picture_batch(stage.source, 0, count=32).to(stage.device), size=128)
     return round(1 / float(stage.average.encode(image).latent_dist.mean.std()), 4)
 
 
-def _mixed() -> torch.autocast:
-    return torch.autocast("cpu", dtype=torch.bfloat16)
+def _mixed(device: torch.device) -> torch.autocast:
+    return torch.autocast(device.type, dtype=torch.bfloat16)

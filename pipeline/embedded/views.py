@@ -6,10 +6,10 @@ any other light, and every cell's object point is known.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,8 +28,6 @@ RINGS_DEG = ((0, 10), (8, 20), (15, 35), (30, 60))
 VIEWS = len(RINGS_DEG) + 3
 """A cluster: the query's view, one in each ring of angles around it, a half turn of it, and any other."""
 
-FIELDS = ("albedo", "normal", "depth", "K", "T")
-
 
 @dataclass(frozen=True, eq=False)
 class Views:
@@ -45,25 +43,35 @@ class Views:
         return len(self.K)
 
 
+_SHARD = np.dtype(
+    [
+        ("albedo", "u1", (VIEWS, SIZE, SIZE, 3)),
+        ("normal", "i1", (VIEWS, SIZE, SIZE, 3)),
+        ("depth", "f2", (VIEWS, SIZE, SIZE)),
+        ("K", "f4", (VIEWS, 3, 3)),
+        ("T", "f4", (VIEWS, 4, 4)),
+    ]
+)
+
+
 def write_shard(path: Path, seeds: range, *, clusters: int) -> None:
     """Views of the objects of ``seeds``; a shard that is there is kept, one that was cut short is made anew."""
     if path.exists():
         return
     found = [cluster for seed in seeds for cluster in object_clusters(seed, clusters=clusters)]
-    partial = path.with_suffix(".partial.npz")
-    arrays: dict[str, Any] = {name: np.stack([c[k] for c in found]) for k, name in enumerate(FIELDS)}
-    np.savez(partial, **arrays)
+    partial = path.with_suffix(f".{os.getpid()}.partial.npy")
+    np.save(partial, np.array(found, _SHARD))
     partial.rename(path)
 
 
 def read_shard(path: Path) -> Views:
-    """A shard in memory."""
-    with np.load(path) as stored:
-        return Views(*(stored[name] for name in FIELDS))
+    """A shard, mapped into memory: processes that read it share what they read."""
+    stored = np.load(path, mmap_mode="r")
+    return Views(*(np.asarray(stored[name]) for name in _SHARD.names or ()))
 
 
 def object_clusters(seed: int, *, clusters: int) -> Iterator[tuple[np.ndarray, ...]]:
-    """Clusters of one object's views as arrays in the order of FIELDS."""
+    """Clusters of one object's views as arrays in the order of the fields of Views."""
     mesh, rng = make_training_object(seed), np.random.default_rng([seed, 0x71E3])
     for _ in range(clusters):
         views = [_view(mesh, R, rng) for R in _rotations(rng)]
@@ -100,12 +108,12 @@ def _view(mesh: Mesh, R: Float[np.ndarray, "3 3"], rng: Rng) -> tuple[np.ndarray
 
 
 TRAINING_SEEDS, VALIDATION_SEEDS = 0, 10_000_000
-OBJECTS_PER_SHARD, CLUSTERS_PER_OBJECT = 20, 2
+OBJECTS_PER_SHARD, CLUSTERS_PER_OBJECT = 10, 4
 
 
 def shard_path(folder: Path, index: int, *, validation: bool = False) -> Path:
     """Where a shard lies."""
-    return folder / f"{'validation' if validation else 'training'}_{index:04d}.npz"
+    return folder / f"{'validation' if validation else 'training'}_{index:04d}.npy"
 
 
 def make_shard(folder: Path, index: int, *, validation: bool = False) -> Path:

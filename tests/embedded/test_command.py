@@ -10,13 +10,14 @@ from pipeline.embedded import __main__ as command
 @pytest.mark.parametrize("ended", [True, False])
 def test_weights_are_replaced_only_once_every_stage_has_ended(monkeypatch, tmp_path, capsys, ended):
     exported, asked = [], []
-    monkeypatch.setattr(command, "make_shard", lambda folder, index: None)
+    monkeypatch.setattr(command, "_make_shards", lambda *_: None)
     for name in ("Autoencoder", "Denoiser", "Descriptors"):
         stage = type(name, (), {"name": name.lower(), "__init__": lambda self, *_: None})
         monkeypatch.setattr(command, name, stage)
     monkeypatch.setattr(command, "train", lambda stage, *_, **__: asked.append(stage.name) or ended)
     monkeypatch.setattr(command, "export", lambda *_: exported.append(True) or 1)
-    command.run(argparse.Namespace(threads=0, minutes=1.0, folder=tmp_path, scale=1.0))
+    options = {"threads": 0, "minutes": 1.0, "scale": 1.0, "batch": 1.0, "device": "cpu", "workers": 0}
+    command.run(argparse.Namespace(folder=tmp_path, **options))
     assert asked == (["autoencoder", "denoiser", "descriptors"] if ended else ["autoencoder"])
     assert exported == ([True] if ended else [])
     assert ("stays as it is" in capsys.readouterr().out) is not ended

@@ -11,11 +11,12 @@ import torch
 
 from pipeline.embedded import losses, views
 from pipeline.embedded.batches import CELLS, QUERIES, TEMPLATES, Source, pair_batch, picture_batch
+from pipeline.embedded.dressing import scanned
 from pipeline.embedded.export import export
-from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
+from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, batches, train
 from pipeline.embedded.views import CLUSTERS_PER_OBJECT
 
-PLAN = Plan(shards=1, autoencoder=3, denoiser=2, descriptors=2)
+PLAN = Plan(shards=1, autoencoder=3, denoiser=2, descriptors=2, easy=1, pictures=4, noises=2, objects=1)
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +96,27 @@ def test_a_query_scores_itself_highest_among_templates(shards):
     assert scores.shape == batch.angle_deg.shape
     assert int(scores[0, 0, 0].argmax()) == 2
     assert float(scores[0, 0, 0, 2]) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_mesh_like_a_scan_differs_from_the_object_in_colour_and_relief_and_nowhere_else(shards):
+    (clusters,), rng = source(shards).objects(0, 1)
+    seen = []
+    for _ in range(8):
+        for cluster, drawn in zip(clusters, scanned(clusters, rng), strict=True):
+            for view, mesh in zip(cluster, drawn, strict=True):
+                assert np.array_equal(view.depth, mesh.depth)
+                assert np.array_equal(view.albedo[~view.mask], mesh.albedo[~view.mask])
+                lengths = np.linalg.norm(mesh.normal[view.mask], axis=-1)
+                np.testing.assert_allclose(lengths, 1, atol=1e-3)
+                seen.append(np.abs(view.albedo[view.mask].astype(float) - mesh.albedo[view.mask]).mean())
+    assert np.median(seen) > 5
+
+
+def test_batches_that_other_processes_draw_are_those_drawn_here(place):
+    stage = Autoencoder(PLAN, place, 3)
+    here, elsewhere = (list(batches(stage, 1, workers)) for workers in (0, 2))
+    assert len(here) == len(elsewhere) == 2
+    assert all(torch.equal(a, b) for a, b in zip(here, elsewhere, strict=True))
 
 
 @pytest.mark.slow

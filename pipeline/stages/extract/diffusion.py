@@ -22,6 +22,7 @@ from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
 from pipeline.stages.extract.decoder import Hook, block_count, decoder_maps, map_shape
+from pipeline.stages.extract.exact import exact_convolutions
 from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
 from pipeline.stages.extract.noise import NoiseMode, draw, noised
 
@@ -134,7 +135,7 @@ class DiffusionBackbone:
 
     @torch.inference_mode()
     def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+        with exact_convolutions():
             latent = self._latent(crops.rgb)
             members = 1 if self.spec.noise == "none" else self.spec.ensemble
             return _mean([self._maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])

@@ -30,6 +30,7 @@ from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_L
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
 from pipeline.stages.extract.diffusion import network_image
+from pipeline.stages.extract.exact import exact_convolutions
 from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
 from pipeline.stages.extract.transformer import Facet, block_tokens, embedded, framed, standardised
 from pipeline.stages.extract.transformers_folder import Architecture, TransformersFolder, find
@@ -143,7 +144,7 @@ class VitBackbone:
     @torch.inference_mode()
     def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         s = self.spec
-        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+        with exact_convolutions():
             found = block_tokens(
                 self.model,
                 embedded(self.model, self._image(crops), stride=s.stride_px),
