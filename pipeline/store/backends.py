@@ -14,6 +14,7 @@ from typing import ClassVar, Protocol
 
 from filelock import FileLock, Timeout
 from zarr.abc.store import Store as ZarrStore
+from zarr.core.buffer import Buffer
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
@@ -58,7 +59,16 @@ class LocalStoreConfig(Spec):
             raise BadInput(
                 "store.root", found=f"{root} ({error.strerror})", needed="a folder that can be made"
             ) from None
-        return Backend(LocalStore(root), str(root), root, lambda key, say: _file_lock(root / ".locks", key, say))
+        return Backend(_Folder(root), str(root), root, lambda key, say: _file_lock(root / ".locks", key, say))
+
+
+class _Folder(LocalStore):
+    """A LocalStore that leaves alone what is there: zarr writes the documents of all groups above a new one again."""
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """As LocalStore.set_if_not_exists, without a file beside it where there is nothing to do."""
+        if not await self.exists(key):
+            await super().set_if_not_exists(key, value)
 
 
 @contextmanager

@@ -199,18 +199,34 @@ class Store:
 
         Half a chunk of a killed run is removed: only a disk has such, and its lock is ours.
         """
-        keys, group = self.keys_below(ref.path), self._group(ref.path)
-        if group is not None and _same_identity(group, ref):
-            for key in keys:
-                if key.endswith(".partial"):
-                    sync(self.backend.zarr.delete(key))
-            return group
-        if keys:
-            self.delete(ref.path)
-        try:
-            return zarr.create_group(self.backend.zarr, path=ref.path, attributes=dict(attributes))
-        except ContainsGroupError:
-            return zarr.open_group(self.backend.zarr, path=ref.path, mode="r+", zarr_format=3)
+        with self._groups_above(ref):
+            keys, group = self.keys_below(ref.path), self._group(ref.path)
+            if group is not None and _same_identity(group, ref):
+                for key in keys:
+                    if key.endswith(".partial"):
+                        sync(self.backend.zarr.delete(key))
+                return group
+            if keys:
+                self.delete(ref.path)
+            try:
+                return zarr.create_group(self.backend.zarr, path=ref.path, attributes=dict(attributes))
+            except ContainsGroupError:
+                return zarr.open_group(self.backend.zarr, path=ref.path, mode="r+", zarr_format=3)
+
+    @contextmanager
+    def _groups_above(self, ref: Ref):
+        """The right to write documents of the groups above entries; on a disk, less those half written by a killed run.
+
+        Zarr writes them with an entry's own group, and leaves those alone that are there.
+        """
+        with self.backend.lock("groups", partial(self._announce_for, ref)):
+            if self.backend.folder is not None:
+                for above in (self.backend.folder / ref.path).parents:
+                    for half in above.glob("zarr.*.partial"):
+                        half.unlink(missing_ok=True)
+                    if above == self.backend.folder:
+                        break
+            yield
 
     def _arrays(self, ref: Ref, layouts: Mapping[str, Layout], rows: int) -> dict[str, zarr.Array]:
         """The entry's arrays: those of an interrupted run when they are of this layout, otherwise new ones.

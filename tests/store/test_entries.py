@@ -201,6 +201,26 @@ def test_verify_reads_every_byte_and_gc_removes_only_what_is_incomplete(local: S
     assert [row.path for row in entries(local)] == [OTHER.path]
 
 
+def test_what_a_killed_run_half_wrote_above_an_entry_goes_with_the_next_one(local: Store):
+    folder = Path(local.place)
+    above = [folder, folder / "features", folder / "features/toy/t0"]
+    for group in above:
+        group.mkdir(parents=True, exist_ok=True)
+        (group / "zarr.0123abcd.partial").write_text("{")
+    fill(local)
+    assert not list(folder.rglob("*.partial"))
+    assert all((group / "zarr.json").exists() for group in above)
+
+
+def test_documents_of_groups_are_written_once(local: Store):
+    fill(local)
+    above = [group / "zarr.json" for group in entry_folder(local).parents if group.is_relative_to(local.place)]
+    assert len(above) == 5
+    before = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in above]
+    fill(local, refs=(OTHER,))
+    assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in above] == before
+
+
 def _fill_slowly(root: str, started, pid_file: str) -> None:
     store = Store(LocalStoreConfig(root=root))
     Path(pid_file).write_text(str(os.getpid()))
