@@ -50,7 +50,7 @@ VAE: dict[str, Any] = {
     "up_block_types": ("UpDecoderBlock2D",) * 3,
 }
 _EMA, _WARMUP = 0.998, 50
-_EDGES = 1.5  # weight of gradient histograms beside descriptors: fuse.learned
+_EDGES = 1.5  # weight of gradient histograms beside descriptors, as in conf/fuse/learned.yaml
 _NOTED = 25  # steps between two waits for the device
 
 

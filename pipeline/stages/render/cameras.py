@@ -11,7 +11,7 @@ from pydantic import Field
 from pipeline.functional.rigid import rigid
 from pipeline.functional.viewpoints import ViewpointSet, viewpoint_rotations
 from pipeline.items.objects import Mesh
-from pipeline.spec import Fraction, Positive, Spec, spec
+from pipeline.spec import Fraction, Spec, spec
 
 
 @spec
@@ -19,8 +19,8 @@ class Studio(Spec):
     """Where the cameras stand and how the light falls. Every field is explained in conf/render."""
 
     viewpoints: ViewpointSet = "fibonacci"
-    count: Positive = 300
-    inplane: Positive = 1
+    count: Annotated[int, Field(ge=1, le=100_000)] = 300
+    inplane: Annotated[int, Field(ge=1, le=360)] = 1
     size: Annotated[int, Field(ge=8, le=4096)] = 256
     supersample: Annotated[int, Field(ge=1, le=8)] = 1
     distance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 6.0
