@@ -21,12 +21,13 @@ def main() -> None:
     """Parse, then train the stages in turn."""
     parser = argparse.ArgumentParser(prog="python -m pipeline.embedded", description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path("cache/embedded"), help="shards, checkpoints, loss curves")
-    parser.add_argument("--minutes", type=float, default=120.0, help="stop after so long; the next call goes on")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the number of steps")
-    parser.add_argument("--batch", type=float, default=1.0, help="of the size of batches: less on a slower machine")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw batches; 0 = this one alone")
-    parser.add_argument("--threads", type=int, default=0, help="0 = all cores")
+    parser.add_argument("--minutes", type=_share, default=120.0, help="stop after so long; the next call goes on")
+    parser.add_argument("--scale", type=_share, default=1.0, help="of the number of steps")
+    parser.add_argument("--batch", type=_share, default=1.0, help="of the size of batches: less on a slower machine")
+    devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+    parser.add_argument("--device", choices=devices, default=devices[-1], help="cuda where there is one")
+    parser.add_argument("--workers", type=_count, default=0, help="processes that draw batches; 0 = this one alone")
+    parser.add_argument("--threads", type=_count, default=0, help="0 = all cores")
     run(parser.parse_args())
 
 
@@ -48,6 +49,20 @@ def run(options: argparse.Namespace) -> None:
 def _make_shards(folder: Path, count: int, workers: int) -> None:
     """The first shards, or with workers all of them before any is read."""
     Parallel(n_jobs=max(workers, 1))(delayed(make_shard)(folder, index) for index in range(count))
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"found {text}, needs a number above 0")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 0 <= value <= 1024:
+        raise argparse.ArgumentTypeError(f"found {text}, needs 0 to 1024")
+    return value
 
 
 def _sized(plan: Plan, batch: float) -> Plan:

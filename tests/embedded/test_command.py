@@ -21,3 +21,14 @@ def test_weights_are_replaced_only_once_every_stage_has_ended(monkeypatch, tmp_p
     assert asked == (["autoencoder", "denoiser", "descriptors"] if ended else ["autoencoder"])
     assert exported == ([True] if ended else [])
     assert ("stays as it is" in capsys.readouterr().out) is not ended
+
+
+@pytest.mark.parametrize(
+    "asked", [["--device", "tpu"], ["--workers", "-1"], ["--batch", "0"], ["--scale", "nan"], ["--minutes", "x"]]
+)
+def test_a_wrong_option_is_told_by_name(monkeypatch, capsys, asked):
+    monkeypatch.setattr("sys.argv", ["pipeline.embedded", *asked])
+    with pytest.raises(SystemExit) as ended:
+        command.main()
+    assert ended.value.code == 2
+    assert f"argument {asked[0]}" in capsys.readouterr().err
