@@ -57,7 +57,7 @@ sweeps: $(STAMP) ## what the paper did not ablate, on the demo data
 ladder: $(STAMP) ## the oracle ladder on the demo data: true mask, true template, true correspondences
 	@$(call sweep,ladder)
 
-train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints; with a GPU ARGS="--workers 15", without ARGS="--batch 0.25 --minutes 600"
+train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints; with a GPU ARGS="--workers 15", without ARGS="--batch 0.25 --scale 0.5 --minutes 600"
 	$(PY) -m pipeline.embedded $(ARGS)
 
 benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights; ARGS="--lmo ... --detections ..."
