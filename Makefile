@@ -60,7 +60,7 @@ ladder: $(STAMP) ## the oracle ladder on the demo data: true mask, true template
 train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints; with a GPU ARGS="--workers 15", without ARGS="--batch 0.25 --scale 0.5 --minutes 600"
 	$(PY) -m pipeline.embedded $(ARGS)
 
-benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights; ARGS="--lmo ... --detections ..."
+benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights, a run on each core; ARGS="--lmo ... --detections ..."
 	$(PY) -m pipeline.benchmark $(ARGS)
 
 comparison: $(STAMP) ## dzop, zs6d, foundpose and fused features on the same detections, one page; wants weights: README

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -29,13 +29,13 @@ from pipeline.items.matches import Correspondences, TemplateMatch
 from pipeline.items.poses import PoseSolution
 from pipeline.spec import NonNegative, spec
 from pipeline.stages.choose import Chooser
-from pipeline.stages.cluster import Clusterer
+from pipeline.stages.cluster import Clusterer, SidedClusterer
 from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthCorresponder
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import DescribingDetector, Detector
 from pipeline.stages.extract import Extractor
 from pipeline.stages.fit import Fit, Fitted, chain
-from pipeline.stages.fuse import FittedFuser, Fuser
+from pipeline.stages.fuse import FittedFuser, Fuser, SidedFuser, fused
 from pipeline.stages.lift import lift
 from pipeline.stages.match import FittedMatcher, Matcher, TruthMatcher
 from pipeline.stages.refine import Refiner
@@ -105,13 +105,17 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """One detection: features by layer, its crop, and its camera. ``truth``: None but for an oracle that needs it."""
+    """One detection: features by layer, its crop, and its camera. ``truth``: None but for an oracle that needs it.
+
+    ``own``: what stages made of the query alone, kept for the next template.
+    """
 
     features: Mapping[int, Float[Tensor, "c h w"]]
     mask: Bool[Tensor, "S S"]
     A_crop_img: Float[np.ndarray, "3 3"]
     K: Float[np.ndarray, "3 3"]
     truth: Truth | None = None
+    own: dict[str, Any] = field(default_factory=dict, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +294,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, start: Hypothe
             pair = _with_saliency(_fused(stages, query, template, bank), query, template)
             parts["pair"] = pair
         with clock("cluster"):
-            clusters = stages.cluster(pair)
+            clusters = _clustered(stages, query, pair)
             parts["clusters"] = clusters
         with clock("correspond"):
             matches = _matched(stages, query, template, pair, clusters)
@@ -316,7 +320,20 @@ def _fused(stages: Stages, query: Query, template: TemplateView, bank: TemplateB
     sides = query.features, template.features, query.mask, template.mask
     if isinstance(stages.fuse, FittedFuser):
         return stages.fuse.by_fitted(*sides, bank.fitted(stages.fuse.fit))
+    if isinstance(stages.fuse, SidedFuser):
+        if "map" not in query.own:
+            query.own["map"] = stages.fuse.side(query.features)
+        return fused(query.own["map"], stages.fuse.side(template.features), query.mask, template.mask)
     return stages.fuse(*sides)
+
+
+def _clustered(stages: Stages, query: Query, pair: FusedPair) -> Clusters:
+    if not isinstance(stages.cluster, SidedClusterer) or pair.query is not query.own.get("map"):
+        return stages.cluster(pair)
+    if "clusters" not in query.own:
+        query.own["clusters"] = stages.cluster.side("query", pair.query, pair.query_mask)
+    template = stages.cluster.side("template", pair.template, pair.template_mask)
+    return stages.cluster.paired(query.own["clusters"], template)
 
 
 def _with_saliency(pair: FusedPair, query: Query, template: TemplateView) -> FusedPair:

@@ -1,5 +1,7 @@
 """The benchmark's table: every system on every data set, the test seed among no other seeds in use."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +55,34 @@ def test_overrides_are_of_every_row_and_have_results_of_their_own(monkeypatch, t
     benchmark.benchmark(tmp_path)
     assert plain.isdisjoint(set(asked) - plain)
     assert len(asked) == 2 * len(benchmark.SYSTEMS)
+
+
+def test_runs_share_the_cores_and_paths_may_hold_any_sign(monkeypatch, tmp_path):
+    asked = []
+
+    def run(choices, out: Path, cache: Path):
+        asked.append(choices)
+        return row(correct=True)
+
+    monkeypatch.setattr(benchmark, "_run", run)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)))
+    benchmark.benchmark(tmp_path / 'my "own" folder', jobs=2)
+    assert all("threads=4" in choices for choices in asked)
+    escaped = str(tmp_path / 'my \\"own\\" folder' / "data")
+    assert all(f'dataset.root="{escaped}"' in choices for choices in asked)
+    asked.clear()
+    benchmark.benchmark(tmp_path)
+    assert all("threads=1" in choices for choices in asked)
+
+
+def test_a_run_that_fails_gives_no_table_and_no_traceback(tmp_path):
+    command = [sys.executable, "-m", "pipeline.benchmark", "--folder", str(tmp_path), "--jobs", "2"]
+    failed = subprocess.run([*command, "dataset.objects=two"], capture_output=True, text=True, check=False)
+    assert failed.returncode == 1
+    assert not failed.stdout
+    assert "dataset.objects: found 'two', needs a valid integer" in failed.stderr
+    assert "benchmark: no table, a run failed" in failed.stderr
+    assert "Traceback" not in failed.stderr
 
 
 def test_recalls_of_vsd_are_a_column_where_they_are_known(monkeypatch, tmp_path):

@@ -38,8 +38,8 @@ class DemoConfig(Spec):
             print(f"writing {self.images} images of {self.objects} procedural objects to {root}", flush=True)
             try:
                 write_dataset(root, **chosen)
-            except OSError as error:
-                raise BadInput(
-                    "dataset.root", found=f"{root} ({error.strerror})", needed="a folder to write to"
-                ) from None
+            except (OSError, BadInput) as error:
+                if not (root / "dataset_info.json").is_file():  # else another process was first, with the same bytes
+                    why = error.strerror if isinstance(error, OSError) else error
+                    raise BadInput("dataset.root", found=f"{root} ({why})", needed="a folder to write to") from None
         return open_dataset(root, name=self.name)

@@ -17,6 +17,7 @@ from pipeline.functional.masks import foreground
 from pipeline.functional.similarity import mutual_nearest, unit
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
+from pipeline.stages.cluster import Side
 
 
 @spec
@@ -41,24 +42,11 @@ class KMeans(Spec):
 
     def __call__(self, pair: FusedPair) -> Clusters:
         """Labels, pairs, and what was clamped or skipped. Raises NoPose for a mask without a cell."""
-        query, query_centre = self._side("query", pair.query, pair.query_mask)
-        template, template_centre = self._side("template", pair.template, pair.template_mask)
-        pairs = mutual_nearest(unit(query_centre) @ unit(template_centre).T)
-        notes = [
-            f"{name}: {len(centre)} of {self.count} clusters"
-            for name, centre in (("query", query_centre), ("template", template_centre))
-            if len(centre) < self.count
-        ]
-        if self.epipolar:
-            positions = [_mean_xy(query)[pairs[:, 0].cpu()], _mean_xy(template)[pairs[:, 1].cpu()]]
-            keep, skipped = self._consistent(*(p.numpy() for p in positions))
-            pairs = pairs if keep is None else pairs[torch.from_numpy(keep).to(pairs.device)]
-            notes += [f"epipolar check skipped: {skipped}"] if skipped else []
-        return Clusters(query, template, pairs, note="; ".join(notes))
+        query = self.side("query", pair.query, pair.query_mask)
+        return self.paired(query, self.side("template", pair.template, pair.template_mask))
 
-    def _side(
-        self, name: str, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]
-    ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "k d"]]:
+    def side(self, name: str, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> Side:
+        """Clusters of one side. Raises NoPose, with the side's name, for a mask without a cell."""
         cells = foreground(mask)
         if len(cells) == 0:
             raise NoPose("cluster", f"{name} mask has no cell")
@@ -66,7 +54,22 @@ class KMeans(Spec):
         of_cell, centre = kmeans(points, count=self.count, seed=self.seed, iterations=self.iterations)
         label = torch.full_like(mask, -1, dtype=torch.int64)
         label.view(-1)[cells] = of_cell
-        return label, centre
+        return Side(label, centre)
+
+    def paired(self, query: Side, template: Side) -> Clusters:
+        """The sides' labels, the clusters that correspond, and what was clamped or skipped."""
+        pairs = mutual_nearest(unit(query.centre) @ unit(template.centre).T)
+        notes = [
+            f"{name}: {len(side.centre)} of {self.count} clusters"
+            for name, side in (("query", query), ("template", template))
+            if len(side.centre) < self.count
+        ]
+        if self.epipolar:
+            positions = [_mean_xy(query.label)[pairs[:, 0].cpu()], _mean_xy(template.label)[pairs[:, 1].cpu()]]
+            keep, skipped = self._consistent(*(p.numpy() for p in positions))
+            pairs = pairs if keep is None else pairs[torch.from_numpy(keep).to(pairs.device)]
+            notes += [f"epipolar check skipped: {skipped}"] if skipped else []
+        return Clusters(query.label, template.label, pairs, note="; ".join(notes))
 
     def _consistent(
         self, query_xy: Float[np.ndarray, "p 2"], template_xy: Float[np.ndarray, "p 2"]

@@ -45,6 +45,15 @@ class TrainedFuser(Protocol):
 
 
 @runtime_checkable
+class SidedFuser(Protocol):
+    """One whose map of a side depends on that side alone: a query's is made once for all its templates."""
+
+    def side(self, features: Mapping[int, Float[Tensor, "c h w"]]) -> Float[Tensor, "d h w"]:
+        """The map of one side."""
+        ...
+
+
+@runtime_checkable
 class FittedFuser(Protocol):
     """A fuser that stands on something fitted to the object's templates."""
 

@@ -66,13 +66,16 @@ class Learned(Spec):
         template_mask: Bool[Tensor, "S S"],
     ) -> FusedPair:
         """Fused maps. Raises NoPose for an empty mask."""
-        head = _head(query[self.layers[0]].device)
+        return fused(self.side(query), self.side(template), query_mask, template_mask)
+
+    def side(self, features: Mapping[int, Float[Tensor, "c h w"]]) -> Float[Tensor, "d h w"]:
+        """One side's map; the other has no say in it."""
+        maps = {layer: features[layer][None].float() for layer in self.layers}
         with torch.no_grad():
-            maps = {layer: torch.stack([query[layer], template[layer]]).float() for layer in self.layers}
-            pair = head(maps)
+            described = _head(features[self.layers[0]].device)(maps)
             if EDGES in maps:
-                pair = with_edges(pair, maps[EDGES], weight=self.edges)
-        return fused(pair[0], pair[1], query_mask, template_mask)
+                described = with_edges(described, maps[EDGES], weight=self.edges)
+        return described[0]
 
 
 @lru_cache(maxsize=2)
