@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
@@ -13,13 +14,16 @@ from pipeline.items.poses import PoseEstimate
 from pipeline.route import Stages, trace_pose
 from pipeline.spec import Runtime
 from pipeline.stages.choose.agreement import Agreement
+from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
 from pipeline.stages.detect.gt_mask import GtMask
+from pipeline.stages.extract.embedded import Embedded
 from pipeline.stages.extract.hog import Hog
 from pipeline.stages.fuse.concat import Concat
+from pipeline.stages.fuse.learned import Learned
 from pipeline.stages.lift import lift
 from pipeline.stages.match.masked_cosine import MaskedCosine
 from pipeline.stages.refine.featuremetric import Featuremetric
@@ -129,6 +133,29 @@ def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache
     first = trace_pose(replace(made.run.stages, second_look=0), query, bank).best
     assert kept.drawn is None
     np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)
+
+
+def test_a_querys_map_and_clusters_are_made_once_where_templates_have_no_say(scenes, cache, monkeypatch):
+    chosen = {"extract": Embedded(), "match": MaskedCosine(top_k=3), "fuse": Learned(), "cluster": KMeans(count=30)}
+    made = graph(scenes, cache, render=Raycast(viewpoints="superfibonacci", count=12), **chosen)
+    made.onboard()
+    found = made.queries.make_crops(scenes.images[0])
+    made.queries.make_features(scenes.images[0], found)
+    query, bank = made.poses.query(found[0])[0], made.templates.bank(found[0].detection.obj_id)
+    asked, side = [], KMeans.side
+    monkeypatch.setattr(KMeans, "side", lambda self, name, *maps: asked.append(name) or side(self, name, *maps))
+    trace = trace_pose(made.run.stages, query, bank)
+    looks = sum(hypothesis.drawn is not None for hypothesis in trace.hypotheses)
+    assert asked.count("query") == 1
+    assert asked.count("template") == 3 + looks
+    for hypothesis in trace.hypotheses:
+        view = hypothesis.drawn or bank.view(hypothesis.template_id)
+        pair = Learned()(query.features, view.features, query.mask, view.mask)
+        assert torch.equal(pair.query, hypothesis.pair.query)
+        assert torch.equal(pair.template, hypothesis.pair.template)
+        clusters = KMeans(count=30)(pair)
+        assert torch.equal(clusters.query_label, hypothesis.clusters.query_label)
+        assert torch.equal(clusters.pairs, hypothesis.clusters.pairs)
 
 
 def test_a_plan_counts_the_passes_of_second_looks(scenes, cache):

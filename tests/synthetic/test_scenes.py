@@ -12,6 +12,7 @@ from pipeline.errors import BadInput
 from pipeline.meshes import diameter_mm, read_mesh
 from pipeline.stages.render.raycast import render_depth
 from pipeline.synthetic.arranging import OCCLUDED
+from pipeline.synthetic.demo import DemoConfig
 from pipeline.synthetic.scenes import write_dataset
 
 SMALL = {"objects": 3, "images": 4, "seed": 7, "size_hw": (240, 320), "per_image": 3, "progress": False}
@@ -148,3 +149,29 @@ def test_a_wrong_argument_is_named(changed, message, tmp_path):
         write_dataset(tmp_path / "data", **(SMALL | changed))
     assert str(error.value).startswith(message)
     assert not any(tmp_path.iterdir())
+
+
+def test_two_processes_that_ask_for_the_same_demo_at_once_both_get_it(tmp_path):
+    ask = (
+        f"from pipeline.synthetic.demo import DemoConfig; print(len(DemoConfig(root={str(tmp_path)!r}).open().targets))"
+    )
+    command = [sys.executable, "-c", ask]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [process.communicate(timeout=120) for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    assert [out.splitlines()[-1] for out, _ in said] == ["18", "18"]
+    assert len(list(tmp_path.iterdir())) == 1  # nothing half-written is left
+
+
+def test_a_demo_that_another_process_made_meanwhile_is_taken_and_anything_else_refused(tmp_path, monkeypatch):
+    def late(root: Path, **chosen):
+        write_dataset(root, **chosen)  # as the other process did
+        write_dataset(root, **chosen)
+
+    monkeypatch.setattr("pipeline.synthetic.demo.write_dataset", late)
+    demo = DemoConfig(root=str(tmp_path), images=1)
+    assert len(demo.open().targets) == 3
+    tmp_path.joinpath("file").write_text("mine")
+    with pytest.raises(BadInput, match=r"dataset.root: found .* needs a folder to write to"):
+        DemoConfig(root=str(tmp_path / "file"), images=1).open()
+    assert tmp_path.joinpath("file").read_text() == "mine"
