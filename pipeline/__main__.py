@@ -6,6 +6,11 @@ and ``dzop lint ...`` take results files.
 
 from __future__ import annotations
 
+import signal
+
+if __name__ == "__main__":  # Ctrl-C while the packages below load ends quietly: nothing has begun
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import json
 import logging
 import math
@@ -52,6 +57,7 @@ FAILED = "DZOP_FAILED_JOBS"
 """Environment variable: folder where a sweep's jobs, in whatever process a launcher runs them, leave their errors."""
 CLOSING = 3
 """Failed jobs, and reasons, that a sweep's last line names; all are told when they fail and in the report."""
+QUOTED = """'dataset.image="my shot.png"'"""
 KILLED = "a process of the sweep was killed, often for want of memory; the same command goes on where it stopped"
 
 
@@ -270,9 +276,15 @@ def _nested(value: Any, where: str) -> Any:
 
 
 def _told(error: BaseException) -> str:
-    """One line; Hydra's list of the places it searched adds nothing."""
-    return "error: " + " ".join(str(error).split("\nConfig search path")[0].split())
+    """One line; Hydra's list of the places it searched adds nothing, nor does its advice to append what is misspelt."""
+    text = str(error).split("\nConfig search path")[0]
+    if text.startswith("Could not override"):
+        text = f"{text.splitlines()[0].rstrip('.')}: found no such field, needs one that the yamls in conf/ have"
+    if "hydra.cc" in text:  # a value that its grammar cannot read
+        text = f"{text.split('See https')[0].strip()}: a value with such signs needs both quotes, as {QUOTED}"
+    return "error: " + " ".join(text.split())
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     main()

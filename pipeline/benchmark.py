@@ -8,11 +8,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.errors import DzopError
 from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
 from pipeline.metrics.recall import instance_recalls
@@ -50,7 +50,7 @@ def benchmark(
     """Tables in Markdown; every run is cached, an interrupted benchmark goes on where it stopped.
 
     ``jobs`` runs at a time share the cores; None: one for each core. ``overrides`` are those of ``python -m pipeline``,
-    for every row alike. Raises CalledProcessError for a run that failed; those under way end first.
+    for every row alike. Raises DzopError for a run that failed.
     """
     parts: dict[str, tuple[str, ...]] = {"objects of the test seed": (*DEMO, _at("dataset.root", folder / "data"))}
     if lmo is not None:
@@ -59,22 +59,44 @@ def benchmark(
             found = ("detect=json", _at("detect.path", detections))
             parts["LM-O, detections"] = (*parts["LM-O, visible masks"], *found)
     results = folder / "results" / digest(list(overrides))[:8] if overrides else folder / "results"
-    wanted = [(title, name) for title in parts for name in SYSTEMS]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jobs = min(jobs or cores, len(wanted))
-    threads = f"threads={max(1, cores // jobs)}"
-    with ThreadPoolExecutor(jobs) as pool:
-        runs: dict[Future[Row], tuple[str, str]] = {}
-        for title, name in wanted:
-            choices = ["method=dzop_x", *SYSTEMS[name], *QUIET, threads, *parts[title], *overrides]
-            out = results / _folder(title) / _folder(name)
-            runs[pool.submit(_run, choices, out, folder / "cache")] = title, name
-        try:
-            rows = {runs[run]: run.result() for run in as_completed(runs)}
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    jobs = min(jobs or cores, len(parts) * len(SYSTEMS))
+    shared = [*QUIET, f"threads={max(1, cores // jobs)}", _at("store.root", folder / "cache")]
+    outs = {(title, name): results / _folder(title) / _folder(name) for title in parts for name in SYSTEMS}
+    choices = {
+        (title, name): ["method=dzop_x", *SYSTEMS[name], *shared, *parts[title], *overrides, _at("out", out)]
+        for (title, name), out in outs.items()
+    }
+    _run_all(choices, jobs=jobs)
+    rows = {run: max(read_rows(out), key=lambda row: row.at) for run, out in outs.items()}
     return "\n\n".join(_table(title, {name: rows[title, name] for name in SYSTEMS}) for title in parts)
+
+
+def _run_all(choices: Mapping[tuple[str, str], Sequence[str]], *, jobs: int) -> None:
+    """Runs of the pipeline, ``jobs`` at a time, with a line for each that has ended.
+
+    The first that fails ends the others, as Ctrl-C does; what is complete in the cache is kept. Raises DzopError.
+    """
+    waiting, running = list(choices), dict[tuple[str, str], tuple[subprocess.Popen[bytes], float]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                command = [sys.executable, "-m", "pipeline", *choices[waiting[0]], "runtime.progress=false"]
+                started = subprocess.Popen(command, stdout=subprocess.DEVNULL, process_group=0)
+                running[waiting.pop(0)] = started, time.perf_counter()
+            time.sleep(0.1)
+            for run in [run for run, (process, _) in running.items() if process.poll() is not None]:
+                process, start = running.pop(run)
+                if process.returncode:
+                    killed = f"was killed by signal {-process.returncode}, often for want of memory"
+                    why = killed if process.returncode < 0 else "failed, see above"
+                    raise DzopError(f"no table: {', '.join(run)}: the run {why}; the same command goes on from here")
+                print(f"{', '.join(run)}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+    finally:
+        for process, _ in running.values():
+            process.terminate()
+        for process, _ in running.values():
+            process.wait()
 
 
 def _table(title: str, rows: Mapping[str, Row]) -> str:
@@ -99,15 +121,6 @@ def _at(field: str, path: Path) -> str:
 
 def _folder(name: str) -> str:
     return name.replace(",", "").replace(" ", "_")
-
-
-def _run(choices: Sequence[str], out: Path, cache: Path) -> Row:
-    """The row of a run of the pipeline; a line of progress when it has ended."""
-    start = time.perf_counter()
-    where = [_at("out", out), _at("store.root", cache), "runtime.progress=false"]
-    subprocess.run([sys.executable, "-m", "pipeline", *choices, *where], check=True, stdout=subprocess.DEVNULL)
-    print(f"{out.parent.name}/{out.name}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-    return max(read_rows(out), key=lambda row: row.at)
 
 
 def _recalls(row: Row, which: Sequence[int]) -> np.ndarray:
@@ -140,12 +153,19 @@ def main() -> None:
     )
     parser.add_argument("overrides", nargs="*", help="for all runs alike, such as second_look=none")
     options = parser.parse_intermixed_args()
-    folder, overrides = options.folder.resolve(), options.overrides
+    folder, lmo, detections = options.folder.resolve(), options.lmo, options.detections
+    if detections is not None and lmo is None:
+        parser.error("--detections are those of LM-O: they need --lmo")
+    if lmo is not None and not lmo.is_dir():
+        parser.error(f"--lmo: found no folder {lmo}, needs that of the dataset")
+    if detections is not None and not detections.is_file():
+        parser.error(f"--detections: found no file {detections}, needs a detector's json")
     try:
-        text = benchmark(folder, lmo=options.lmo, detections=options.detections, jobs=options.jobs, overrides=overrides)
-    except subprocess.CalledProcessError as error:  # which has said on stderr what was wrong
-        sys.exit(f"benchmark: no table, a run failed: {' '.join(error.cmd[1:])}")
-    print(text)
+        print(benchmark(folder, lmo=lmo, detections=detections, jobs=options.jobs, overrides=options.overrides))
+    except DzopError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: what was complete is kept, and the same command goes on from there")
 
 
 def _positive(text: str) -> int:

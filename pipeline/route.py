@@ -120,7 +120,10 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class TemplateView:
-    """One template as correspondences need it. ``rgb``: its crop, where it was drawn for a query and is not stored."""
+    """One template as correspondences need it. ``rgb``: its crop, where it was drawn for a query and is not stored.
+
+    ``own``: what stages made of the template alone, kept for the next query.
+    """
 
     features: Mapping[int, Float[Tensor, "c h w"]]
     mask: Bool[Tensor, "S S"]
@@ -129,6 +132,7 @@ class TemplateView:
     K: Float[np.ndarray, "3 3"]
     T_cam_obj: Float[np.ndarray, "4 4"]
     rgb: UInt8[np.ndarray, "S S 3"] | None = None
+    own: dict[str, Any] = field(default_factory=dict, repr=False)
 
 
 class TemplateBank(Protocol):
@@ -294,7 +298,7 @@ def _hypothesis(stages: Stages, query: Query, bank: TemplateBank, start: Hypothe
             pair = _with_saliency(_fused(stages, query, template, bank), query, template)
             parts["pair"] = pair
         with clock("cluster"):
-            clusters = _clustered(stages, query, pair)
+            clusters = _clustered(stages, query, template, pair)
             parts["clusters"] = clusters
         with clock("correspond"):
             matches = _matched(stages, query, template, pair, clusters)
@@ -327,13 +331,14 @@ def _fused(stages: Stages, query: Query, template: TemplateView, bank: TemplateB
     return stages.fuse(*sides)
 
 
-def _clustered(stages: Stages, query: Query, pair: FusedPair) -> Clusters:
+def _clustered(stages: Stages, query: Query, template: TemplateView, pair: FusedPair) -> Clusters:
     if not isinstance(stages.cluster, SidedClusterer) or pair.query is not query.own.get("map"):
         return stages.cluster(pair)
     if "clusters" not in query.own:
         query.own["clusters"] = stages.cluster.side("query", pair.query, pair.query_mask)
-    template = stages.cluster.side("template", pair.template, pair.template_mask)
-    return stages.cluster.paired(query.own["clusters"], template)
+    if "clusters" not in template.own:
+        template.own["clusters"] = stages.cluster.side("template", pair.template, pair.template_mask)
+    return stages.cluster.paired(query.own["clusters"], template.own["clusters"])
 
 
 def _with_saliency(pair: FusedPair, query: Query, template: TemplateView) -> FusedPair:

@@ -71,9 +71,14 @@ def lint_command(arguments: Sequence[str]) -> None:
         print(f"and {len(report.faults) - FAULTS_SHOWN} faults more")
     for warning in report.warnings:
         print(f"note:  {warning}")
-    print(f"{path}: {report.rows} rows, {len(report.faults)} faults, {len(report.warnings)} notes")
+    counts = [
+        _counted(report.rows, "row"),
+        _counted(len(report.faults), "fault"),
+        _counted(len(report.warnings), "note"),
+    ]
+    print(f"{path}: {', '.join(counts)}")
     if report.faults:
-        raise DzopError(f"{path}: found {len(report.faults)} faults, the first of them: {report.faults[0]}")
+        raise DzopError(f"{path}: found {_counted(len(report.faults), 'fault')}, told above")
 
 
 def _score_parser() -> argparse.ArgumentParser:
@@ -184,3 +189,7 @@ def _row(given: Scoreable, scored: Scored) -> Row:
         metrics=summary_of(scored)["metrics"],
         scores=scored.scores,
     )
+
+
+def _counted(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"

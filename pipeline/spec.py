@@ -110,6 +110,11 @@ def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
             count = first["ctx"].get("max_length", first["ctx"].get("min_length"))
             needed = f"{least_or_most} {count} value{'' if count == 1 else 's'}"
             raise BadInput(field, found=_shown(first["input"]), needed=needed) from None
+        if first["type"] == "missing" and isinstance(first["loc"][-1], int):  # the first value that a tuple lacks
+            field = ".".join([where, *(str(p) for p in first["loc"][:-1])])
+            raise BadInput(
+                field, found=_shown(first["input"]), needed="more values: its yaml in conf/ says which"
+            ) from None
         message = first["msg"].removeprefix("Value error, ")
         needed = message[0].lower() + message[1:].removeprefix("nput should be ")
         needed = needed.removeprefix("i") if message.startswith("Input should be ") else needed

@@ -1,8 +1,10 @@
 """What a user is told: of layers, of weights, of jobs that fail, of masks that are odd, and after Ctrl-C."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -83,24 +85,76 @@ def test_a_sweep_ends_with_a_line_that_can_be_read(monkeypatch):
     assert others.endswith("; and 6 more, told above")
 
 
-@pytest.mark.parametrize(
-    ("drawn", "told"),
-    [((60, 80, 1, 1), "the mask has 1 pixel;"), ((0, 0, 120, 160), "the mask covers 100% of the image;")],
-)
-def test_an_odd_mask_is_told_and_kept_in_the_record(capsys, monkeypatch, tmp_path, scene, drawn, told):
-    monkeypatch.chdir(tmp_path)
-    row, column, h, w = drawn
+def inside(row: int, column: int, h: int, w: int) -> np.ndarray:
     mask = np.zeros((120, 160), np.uint8)
     mask[row : row + h, column : column + w] = 255
+    return mask
+
+
+@pytest.fixture
+def photo(capsys, monkeypatch, tmp_path, scene):
+    """A run on one photograph of the scene; beside the mesh and the photograph, the arguments say all."""
+    monkeypatch.chdir(tmp_path)
+    mesh, image = f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={scene}/test/000001/rgb/000000.png"
+
+    def run(*given: str) -> Ran:
+        return run_dzop(capsys, monkeypatch, "dataset=photo", mesh, image, "dataset.K=[150,150,80,60]", *SMALL, *given)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("mask", "told"),
+    [
+        (inside(60, 80, 1, 1), "the mask has 1 pixel;"),
+        (inside(0, 0, 120, 160), "the mask covers 100% of the image;"),
+        (255 - inside(40, 50, 40, 50), "the mask covers 90% of the image; is it the object's, and not inverted?"),
+    ],
+    ids=["a pixel", "everything", "inverted"],
+)
+def test_an_odd_mask_is_told_and_kept_in_the_record(photo, tmp_path, mask, told):
     Image.fromarray(mask).save("mask.png")
-    photo = (f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={scene}/test/000001/rgb/000000.png")
-    given = ("dataset=photo", *photo, "dataset.K=[150,150,80,60]", "dataset.mask=mask.png", *SMALL)
-    ran = run_dzop(capsys, monkeypatch, *given)
+    ran = photo("dataset.mask=mask.png")
     assert ran.status == 0, ran.err
     assert f"warning: scene 0, image 0, object 1: {told}" in ran.out
     record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
     (warning,) = record["warnings"]
     assert told in warning
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (("dataset.bbox=[40,30,130,100]",), "of the box lies outside the image; is it x, y, width, height"),
+        (("dataset.bbox=[40,30,60,60]", "dataset.K=[300,300,170,90]"), "principal point (170, 90) lies outside"),
+        (("dataset.bbox=[40,30,60,60]", "dataset.K=[80,60,75,150]"), "principal point (75, 150) lies outside"),
+        (("dataset.bbox=[40,30,60,60]",), ""),
+    ],
+    ids=["corners", "larger image", "swapped", "as it should be"],
+)
+def test_an_odd_box_or_camera_is_told(photo, given, told):
+    ran = photo(*given)
+    assert ran.status == 0, ran.err
+    assert told in ran.out
+    assert ("warning:" in ran.out) == bool(told)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("dataset.bbox=[1,2,3]", "error: dataset.bbox: found [1, 2, 3], needs more values"),
+        ("dataset.msk=a", "error: Could not override 'dataset.msk': found no such field, needs one that the yamls"),
+        (
+            "dataset.mask=my(mask.png",
+            """'my(mask.png': a value with such signs needs both quotes, as 'dataset.image=""",
+        ),
+    ],
+)
+def test_a_field_that_cannot_be_read_is_told_with_what_would_be_right(photo, given, told):
+    ran = photo(given)
+    assert ran.status == 1
+    assert told in ran.err
+    assert len(ran.err.strip().splitlines()) == 1
 
 
 def test_an_ordinary_mask_is_no_odd_one(dzop, tmp_path):
@@ -122,3 +176,15 @@ command.main()
 def test_ctrl_c_leaves_one_line():
     ran = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=120, check=False)
     assert ran.stderr == "interrupted: what was complete is kept, and the next run goes on from there\n"
+
+
+def test_ctrl_c_while_packages_load_ends_quietly():
+    process = subprocess.Popen([sys.executable, "-m", "pipeline"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    maps = Path(f"/proc/{process.pid}/maps")
+    until = time.monotonic() + 30
+    while "libtorch" not in maps.read_text() and time.monotonic() < until:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode in (-signal.SIGINT, 1)
+    assert b"Traceback" not in out + err

@@ -135,7 +135,7 @@ def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache
     np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)
 
 
-def test_a_querys_map_and_clusters_are_made_once_where_templates_have_no_say(scenes, cache, monkeypatch):
+def test_a_side_is_clustered_once_where_the_other_has_no_say(scenes, cache, monkeypatch):
     chosen = {"extract": Embedded(), "match": MaskedCosine(top_k=3), "fuse": Learned(), "cluster": KMeans(count=30)}
     made = graph(scenes, cache, render=Raycast(viewpoints="superfibonacci", count=12), **chosen)
     made.onboard()
@@ -148,6 +148,9 @@ def test_a_querys_map_and_clusters_are_made_once_where_templates_have_no_say(sce
     looks = sum(hypothesis.drawn is not None for hypothesis in trace.hypotheses)
     assert asked.count("query") == 1
     assert asked.count("template") == 3 + looks
+    trace_pose(made.run.stages, replace(query, own={}), bank)  # another query that meets the same templates
+    assert asked.count("query") == 2
+    assert asked.count("template") == 3 + 2 * looks
     for hypothesis in trace.hypotheses:
         view = hypothesis.drawn or bank.view(hypothesis.template_id)
         pair = Learned()(query.features, view.features, query.mask, view.mask)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,10 @@ from pipeline.whole import IMAGE_FORMATS
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """8-bit rgb. Grey gives three equal channels; 16-bit grey is scaled so that 65535 becomes 255; alpha is dropped."""
+    """8-bit rgb, upright as EXIF says.
+
+    Grey gives three equal channels; 16-bit grey is scaled so that 65535 becomes 255; alpha is dropped.
+    """
     with _open(path) as image:
         if image.mode.startswith("I"):
             grey = np.round(np.asarray(image, dtype=np.float64) / 257).clip(0, 255).astype(np.uint8)
@@ -42,14 +46,25 @@ def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
     return (values * depth_scale).astype(np.float32)
 
 
+_ORIENTATION_TAG = 0x0112
+_UPRIGHT = {
+    2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
+    3: PIL.Image.Transpose.ROTATE_180,
+    4: PIL.Image.Transpose.FLIP_TOP_BOTTOM,
+    5: PIL.Image.Transpose.TRANSPOSE,
+    6: PIL.Image.Transpose.ROTATE_270,
+    7: PIL.Image.Transpose.TRANSVERSE,
+    8: PIL.Image.Transpose.ROTATE_90,
+}
 _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(h, w) from the file's header; the pixels are not read."""
+    """(h, w) of the upright image, from the file's header; the pixels are not read."""
     try:
         with _header(path) as image:
-            return image.height, image.width
+            on_side = _orientation(image) in (5, 6, 7, 8)
+            return (image.width, image.height) if on_side else (image.height, image.width)
     except _BROKEN as error:
         raise _unreadable(path, error) from None
 
@@ -66,11 +81,26 @@ def _open(path: Path) -> PIL.Image.Image:
         image.load()  # PIL notices a truncated file only when it reads the pixels
     except _BROKEN as error:
         raise _unreadable(path, error) from None
-    return image
+    turn = _UPRIGHT.get(_orientation(image))
+    return image if turn is None else image.transpose(turn)
+
+
+def _orientation(image: PIL.Image.Image) -> int:
+    """EXIF's, 1 where there is none: how cameras say that they were held on their side (cv2.imread turns by it too).
+
+    PNG files are not asked, for whom PIL would read all pixels first, and TIFF files PIL turns by itself.
+    """
+    if image.format not in ("JPEG", "MPO", "WEBP"):
+        return 1
+    try:
+        found = image.getexif().get(_ORIENTATION_TAG, 1)
+    except (*_BROKEN, KeyError, TypeError, struct.error, OverflowError):  # a photograph all the same
+        return 1
+    return found if isinstance(found, int) else 1
 
 
 def _unreadable(path: Path, error: Exception) -> BadInput:
     if isinstance(error, FileNotFoundError):
         return BadInput(path, found="no such file", needed="an image")
     found = "no image format known" if isinstance(error, PIL.UnidentifiedImageError) else str(error)
-    return BadInput(path, found=f"a broken image ({found})", needed="a complete PNG, JPEG or TIFF")
+    return BadInput(path, found=f"a broken image ({found})", needed="a complete PNG, JPEG, TIFF or WebP")

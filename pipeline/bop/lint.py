@@ -64,9 +64,12 @@ def _units(path: Path, rows: Sequence[ResultRow]) -> list[str]:
 def _precision(rows: Sequence[ResultRow]) -> list[str]:
     off = np.array([np.abs(r.T_cam_obj[:3, :3] @ r.T_cam_obj[:3, :3].T - np.eye(3)).max() for r in rows])
     behind = sum(row.T_cam_obj[2, 3] <= 0 for row in rows)
+    near = sum(np.linalg.norm(row.T_cam_obj[:3, 3]) < _METRES_MM for row in rows)
     notes = []
     if (off > ORTHONORMAL).any():
         notes.append(f"R of {(off > ORTHONORMAL).sum()} rows is orthonormal to {off.max():.2g} only (few digits?)")
+    if near:
+        notes.append(f"t of {near} rows is shorter than {_METRES_MM:g} mm (in metres?)")
     if behind:
         notes.append(f"{behind} poses lie behind the camera")
     return notes

@@ -90,8 +90,10 @@ def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except FileNotFoundError:
         raise BadInput(path, found="no such file", needed="a BOP results csv") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise BadInput(path, found=error, needed="a BOP results csv") from None
+    except UnicodeDecodeError:
+        raise BadInput(path, found="bytes that are no text", needed="a BOP results csv") from None
     rows: list[ResultRow] = []
     faults: list[BadInput] = []
     times: dict[tuple[int, int], float] = {}

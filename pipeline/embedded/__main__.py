@@ -21,9 +21,11 @@ def main() -> None:
     """Parse, then train the stages in turn."""
     parser = argparse.ArgumentParser(prog="python -m pipeline.embedded", description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path("cache/embedded"), help="shards, checkpoints, loss curves")
-    parser.add_argument("--minutes", type=_share, default=120.0, help="stop after so long; the next call goes on")
-    parser.add_argument("--scale", type=_share, default=1.0, help="of the number of steps")
-    parser.add_argument("--batch", type=_share, default=1.0, help="of the size of batches: less on a slower machine")
+    parser.add_argument("--minutes", type=_above_zero, default=120.0, help="stop after so long; the next call goes on")
+    parser.add_argument("--scale", type=_above_zero, default=1.0, help="of the number of steps")
+    parser.add_argument(
+        "--batch", type=_above_zero, default=1.0, help="of the size of batches: less on a slower machine"
+    )
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
     parser.add_argument("--device", choices=devices, default=devices[-1], help="cuda where there is one")
     parser.add_argument("--workers", type=_count, default=0, help="processes that draw batches; 0 = this one alone")
@@ -51,7 +53,7 @@ def _make_shards(folder: Path, count: int, workers: int) -> None:
     Parallel(n_jobs=max(workers, 1))(delayed(make_shard)(folder, index) for index in range(count))
 
 
-def _share(text: str) -> float:
+def _above_zero(text: str) -> float:
     value = float(text)
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"found {text}, needs a number above 0")

@@ -2,6 +2,7 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -9,6 +10,7 @@ from PIL import Image
 from tiny_bop import HALF_MM, POSES, SIZE_HW, K, edit_json, rectangle, write_box_ply, write_json, write_tiny_bop
 
 from pipeline.bop.dataset import Dataset, DatasetConfig, open_dataset
+from pipeline.bop.images import image_size, read_mask, read_rgb
 from pipeline.bop.scene import check_K
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
@@ -93,6 +95,30 @@ def test_grey_images_have_three_equal_channels_and_8_bits(root: Path, scene: Pat
         assert rgb.dtype == np.uint8
         assert (rgb == rgb[..., :1]).all()
         assert np.abs(rgb[..., 0] - ramp / 257).max() <= 1  # rounding of 16 to 8 bit
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "WEBP", "TIFF"])
+@pytest.mark.parametrize("orientation", [None, *range(1, 9), 77])
+def test_photographs_are_read_upright_as_opencv_reads_them(tmp_path: Path, kind: str, orientation: int | None):
+    rgb = np.zeros((40, 64, 3), np.uint8)
+    rgb[:20, :32], rgb[:20, 32:], rgb[20:, :32] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    exif = Image.Exif()
+    if orientation:
+        exif[0x0112] = orientation
+    path = tmp_path / f"photo.{kind.lower()}"
+    Image.fromarray(rgb).save(path, kind, exif=exif, **({} if kind == "TIFF" else {"quality": 95}))
+    read = read_rgb(path)
+    assert image_size(path) == read.shape[:2]
+    if kind == "JPEG":  # of others OpenCV reads no orientation, or nothing at all
+        seen = cv2.imread(str(path))[..., ::-1]
+        assert read.shape == seen.shape
+        assert np.abs(read.astype(int) - seen).mean() < 3
+    turned = orientation in (5, 6, 7, 8)
+    assert read.shape[:2] == ((64, 40) if turned else (40, 64))
+    red = {None: (0, 0), 1: (0, 0), 77: (0, 0), 2: (0, -1), 3: (-1, -1), 4: (-1, 0), 5: (0, 0), 6: (0, -1), 7: (-1, -1)}
+    y, x = red.get(orientation, (-1, 0))
+    assert read[8 if y == 0 else -9, 8 if x == 0 else -9].argmax() == 0
+    assert read_mask(path).shape == read.shape[:2]
 
 
 def test_without_a_targets_file_every_annotated_instance_is_asked_for(root: Path):
