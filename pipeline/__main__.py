@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import signal
 
-if __name__ == "__main__":  # Ctrl-C while the packages below load ends quietly: nothing has begun
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while the packages below load ends quietly: nothing has begun
 
 import json
 import logging
@@ -286,5 +286,6 @@ def _told(error: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     main()

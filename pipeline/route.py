@@ -107,7 +107,7 @@ class Truth:
 class Query:
     """One detection: features by layer, its crop, and its camera. ``truth``: None but for an oracle that needs it.
 
-    ``own``: what stages made of the query alone, kept for the next template.
+    ``own``: what stages made of the query alone, by stage, kept for the next template.
     """
 
     features: Mapping[int, Float[Tensor, "c h w"]]
@@ -115,14 +115,14 @@ class Query:
     A_crop_img: Float[np.ndarray, "3 3"]
     K: Float[np.ndarray, "3 3"]
     truth: Truth | None = None
-    own: dict[str, Any] = field(default_factory=dict, repr=False)
+    own: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
 class TemplateView:
     """One template as correspondences need it. ``rgb``: its crop, where it was drawn for a query and is not stored.
 
-    ``own``: what stages made of the template alone, kept for the next query.
+    ``own``: what stages made of the template alone, by stage, kept for the next query.
     """
 
     features: Mapping[int, Float[Tensor, "c h w"]]
@@ -132,7 +132,7 @@ class TemplateView:
     K: Float[np.ndarray, "3 3"]
     T_cam_obj: Float[np.ndarray, "4 4"]
     rgb: UInt8[np.ndarray, "S S 3"] | None = None
-    own: dict[str, Any] = field(default_factory=dict, repr=False)
+    own: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
 
 class TemplateBank(Protocol):
@@ -325,20 +325,21 @@ def _fused(stages: Stages, query: Query, template: TemplateView, bank: TemplateB
     if isinstance(stages.fuse, FittedFuser):
         return stages.fuse.by_fitted(*sides, bank.fitted(stages.fuse.fit))
     if isinstance(stages.fuse, SidedFuser):
-        if "map" not in query.own:
-            query.own["map"] = stages.fuse.side(query.features)
-        return fused(query.own["map"], stages.fuse.side(template.features), query.mask, template.mask)
+        if stages.fuse not in query.own:
+            query.own[stages.fuse] = stages.fuse.side(query.features)
+        return fused(query.own[stages.fuse], stages.fuse.side(template.features), query.mask, template.mask)
     return stages.fuse(*sides)
 
 
 def _clustered(stages: Stages, query: Query, template: TemplateView, pair: FusedPair) -> Clusters:
-    if not isinstance(stages.cluster, SidedClusterer) or pair.query is not query.own.get("map"):
+    if not isinstance(stages.cluster, SidedClusterer) or not isinstance(stages.fuse, SidedFuser):
         return stages.cluster(pair)
-    if "clusters" not in query.own:
-        query.own["clusters"] = stages.cluster.side("query", pair.query, pair.query_mask)
-    if "clusters" not in template.own:
-        template.own["clusters"] = stages.cluster.side("template", pair.template, pair.template_mask)
-    return stages.cluster.paired(query.own["clusters"], template.own["clusters"])
+    made = stages.fuse, stages.cluster
+    if made not in query.own:
+        query.own[made] = stages.cluster.side("query", pair.query, pair.query_mask)
+    if made not in template.own:
+        template.own[made] = stages.cluster.side("template", pair.template, pair.template_mask)
+    return stages.cluster.paired(query.own[made], template.own[made])
 
 
 def _with_saliency(pair: FusedPair, query: Query, template: TemplateView) -> FusedPair:

@@ -148,9 +148,11 @@ def test_a_side_is_clustered_once_where_the_other_has_no_say(scenes, cache, monk
     looks = sum(hypothesis.drawn is not None for hypothesis in trace.hypotheses)
     assert asked.count("query") == 1
     assert asked.count("template") == 3 + looks
-    trace_pose(made.run.stages, replace(query, own={}), bank)  # another query that meets the same templates
+    trace_pose(made.run.stages, replace(query), bank)  # another query that meets the same templates
     assert asked.count("query") == 2
     assert asked.count("template") == 3 + 2 * looks
+    other = replace(made.run.stages, cluster=KMeans(count=10))  # other clusters are none of those
+    assert trace_pose(other, query, bank).best.clusters.query_label.max() == 9
     for hypothesis in trace.hypotheses:
         view = hypothesis.drawn or bank.view(hypothesis.template_id)
         pair = Learned()(query.features, view.features, query.mask, view.mask)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.bop.masks import decode
-from pipeline.graph.context import Context
+from pipeline.graph.context import Context, ImageId
 from pipeline.items.views import Detection
 
 FEW_PX = 16  # a mask of fewer pixels shows no shape
@@ -20,14 +20,20 @@ def doubts(run: Context, detections: Sequence[Detection]) -> list[str]:
     """One line for each detection that is odd, and for each camera whose poses nothing vouches for."""
     found = []
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
-        (h, w), (cx, cy) = run.dataset.image_size(scene_id, im_id), run.K((scene_id, im_id))[:2, 2]
-        if not run.dataset.has_ground_truth(scene_id) and not (0 <= cx <= w and 0 <= cy <= h):
-            where = f"K's principal point ({cx:g}, {cy:g}) lies outside the image of {w} x {h} (width x height)"
-            found.append(f"scene {scene_id}, image {im_id}: {where}; is it the K of this image at this size?")
+        if not run.dataset.has_ground_truth(scene_id) and (why := _camera_doubt(run, (scene_id, im_id))):
+            found.append(f"scene {scene_id}, image {im_id}: {why}")
     for d in detections:
         if d.defect is None and (why := _doubt(run, d)):
             found.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {why}")
     return found
+
+
+def _camera_doubt(run: Context, image: ImageId) -> str:
+    (h, w), (cx, cy) = run.dataset.image_size(*image), run.K(image)[:2, 2]
+    if 0 <= cx <= w and 0 <= cy <= h:
+        return ""
+    where = f"({cx:g}, {cy:g}) lies outside the image of {w} x {h} (width x height)"
+    return f"K's principal point {where}; is it the K of this image at this size?"
 
 
 def _doubt(run: Context, d: Detection) -> str:
