@@ -254,7 +254,8 @@ def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float)
     missing = [answer for answer in answers if isinstance(answer, NoEstimate)]
     if missing:
         print("\n" + failures_table(missing))
-    print(f"\n{len(answers) - len(missing)} poses, {len(missing)} without (each with its reason)")
+    reasons = " (each with its reason)" if missing else ""
+    print(f"\n{len(answers) - len(missing)} poses, {len(missing)} without{reasons}")
     if judged is not None:
         print(scores_table(judged.scored, theta_max=theta_max))
         if judged.correspondences:
