@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +176,15 @@ def test_lint_lists_every_fault(dzop):
     ):
         assert part in ran.out, part
     assert "found 6 faults" in ran.err
+
+
+def test_lint_notes_single_rows_in_metres(dzop):
+    first, *others = true_rows(Path("tiny"))
+    write_results(Path("m_tiny-test.csv"), [replace(in_metres(first), time_s=first.time_s), *others])
+    ran = dzop("lint", "m_tiny-test.csv", "--dataset", "tiny")
+    assert ran.status == 0
+    assert "note:  t of 1 rows is shorter than 20 mm (in metres?)" in ran.out
+    assert "0 faults, 1 note\n" in ran.out
 
 
 def test_lint_notices_metres_and_rounded_rotations(dzop):
