@@ -1,6 +1,7 @@
 """Runs the command line in this process, as a shell would, and gives back what it printed."""
 
 import re
+import signal
 import sys
 from dataclasses import dataclass
 
@@ -37,3 +38,8 @@ def run_dzop(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *ar
     printed = capsys.readouterr()
     err = printed.err + (status if isinstance(status, str) else "")
     return Ran(1 if isinstance(status, str) else status, printed.out, err)
+
+
+def heeds_ctrl_c() -> None:
+    """For a child before it starts: what a shell runs in the background ignores SIGINT, and so do its children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import heeds_ctrl_c
 
 from pipeline import benchmark
 from pipeline.items.scores import Scores
@@ -76,7 +77,8 @@ SMALL = ("dataset.objects=1", "dataset.images=2", "dataset.per_image=1", "render
 
 def started(folder: Path, *more: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "pipeline.benchmark", "--folder", str(folder), "--jobs", "2", *more]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, **streams, start_new_session=True, preexec_fn=heeds_ctrl_c)
 
 
 def test_a_run_that_fails_gives_no_table_and_no_traceback(tmp_path):

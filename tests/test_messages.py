@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import Ran, run_dzop
+from command import Ran, heeds_ctrl_c, run_dzop
 from make_vit import write_vit
 from PIL import Image
 
@@ -178,13 +178,16 @@ def test_ctrl_c_leaves_one_line():
     assert ran.stderr == "interrupted: what was complete is kept, and the next run goes on from there\n"
 
 
-def test_ctrl_c_while_packages_load_ends_quietly():
-    process = subprocess.Popen([sys.executable, "-m", "pipeline"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+def test_ctrl_c_while_packages_load_ends_quietly(tmp_path):
+    command = [sys.executable, "-m", "pipeline", "step=detect"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=heeds_ctrl_c
+    )
     maps = Path(f"/proc/{process.pid}/maps")
     until = time.monotonic() + 30
     while "libtorch" not in maps.read_text() and time.monotonic() < until:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=60)
     assert process.returncode in (-signal.SIGINT, 1)
     assert b"Traceback" not in out + err
