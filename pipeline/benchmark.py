@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import os
+import signal
 import subprocess
 import sys
 import time
@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from joblib import cpu_count
 
 from pipeline.errors import DzopError
 from pipeline.items.scores import Scores
@@ -59,7 +60,7 @@ def benchmark(
             found = ("detect=json", _at("detect.path", detections))
             parts["LM-O, detections"] = (*parts["LM-O, visible masks"], *found)
     results = folder / "results" / digest(list(overrides))[:8] if overrides else folder / "results"
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = cpu_count()
     jobs = min(jobs or cores, len(parts) * len(SYSTEMS))
     shared = [*QUIET, f"threads={max(1, cores // jobs)}", _at("store.root", folder / "cache")]
     outs = {(title, name): results / _folder(title) / _folder(name) for title in parts for name in SYSTEMS}
@@ -78,6 +79,10 @@ def _run_all(choices: Mapping[tuple[str, str], Sequence[str]], *, jobs: int) -> 
     The first that fails ends the others, as Ctrl-C does; what is complete in the cache is kept. Raises DzopError.
     """
     waiting, running = list(choices), dict[tuple[str, str], tuple[subprocess.Popen[bytes], float]]()
+    interrupts: list[int] = []  # heeded below, not wherever they come: a run just started would be known to nobody
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
@@ -85,6 +90,8 @@ def _run_all(choices: Mapping[tuple[str, str], Sequence[str]], *, jobs: int) -> 
                 started = subprocess.Popen(command, stdout=subprocess.DEVNULL, process_group=0)
                 running[waiting.pop(0)] = started, time.perf_counter()
             time.sleep(0.1)
+            if interrupts:
+                raise KeyboardInterrupt
             for run in [run for run, (process, _) in running.items() if process.poll() is not None]:
                 process, start = running.pop(run)
                 if process.returncode:
@@ -97,6 +104,7 @@ def _run_all(choices: Mapping[tuple[str, str], Sequence[str]], *, jobs: int) -> 
             process.terminate()
         for process, _ in running.values():
             process.wait()
+        signal.signal(signal.SIGINT, before)
 
 
 def _table(title: str, rows: Mapping[str, Row]) -> str:

@@ -54,17 +54,19 @@ def _make_shards(folder: Path, count: int, workers: int) -> None:
 
 
 def _above_zero(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"found {text}, needs a number above 0")
     return value
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if not 0 <= value <= 1024:
-        raise argparse.ArgumentTypeError(f"found {text}, needs 0 to 1024")
-    return value
+    if not text.isdecimal() or int(text) > 1024:
+        raise argparse.ArgumentTypeError(f"found {text}, needs a whole number from 0 to 1024")
+    return int(text)
 
 
 def _sized(plan: Plan, batch: float) -> Plan:
