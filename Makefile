@@ -61,7 +61,7 @@ train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints;
 	$(PY) -m pipeline.embedded $(ARGS)
 
 benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights, a run on each core; ARGS="--lmo ... --detections ..."
-	$(PY) -m pipeline.benchmark $(ARGS)
+	$(PY) -m benchmarks.accuracy $(ARGS)
 
 comparison: $(STAMP) ## dzop, zs6d, foundpose and fused features on the same detections, one page; wants weights: README
 	@( $(call sweep,backbones) ); status=$$?; $(PY) -m pipeline dataset=demo step=report $(ARGS); exit $$status
@@ -79,7 +79,7 @@ test-fast: $(STAMP) ## the tests that take less than 20 seconds each
 	$(PY) -m pytest -m "not slow and not faults" $(ARGS)
 
 test-faults: $(STAMP) ## faults injected for real (50 kills of every step, full disk, flipped bytes, ...) and long fuzzing, counts printed
-	DZOP_FUZZ=$${DZOP_FUZZ:-1000} $(PY) -m pytest -m "faults or not faults" tests/faults tests/strangers tests/store $(ARGS)
+	DZOP_FUZZ=$${DZOP_FUZZ:-1000} $(PY) -m pytest -m "faults or not faults" tests/faults tests/untrusted_input tests/store $(ARGS)
 
 lint: $(STAMP) ## style, types, import contracts
 	$(PY) -m ruff check .

@@ -17,7 +17,7 @@ from benchmarks.measure import Figure, machine, table
 from benchmarks.online import online
 from benchmarks.rendering import rendering
 from benchmarks.storing import storing
-from pipeline.whole import write_json
+from pipeline.io.files import write_json
 
 PARTS: dict[str, Callable[..., list[Figure]]] = {
     "online": online,

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from benchmarks.measure import Figure, interleaved
+from pipeline.backbones.determinism import exact_convolutions
+from pipeline.backbones.stable_diffusion.features import DiffusionBackbone, DiffusionFeatures
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
-from pipeline.stages.extract.diffusion import DiffusionBackbone, DiffusionFeatures
 from pipeline.stages.extract.embedded import Embedded
-from pipeline.stages.extract.exact import exact_convolutions
 from pipeline.stages.extract.random_sd import RandomSD
 
 LAYERS = (2, 5, 8, 11)

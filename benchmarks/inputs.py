@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from pipeline.fits import Fit, Fitted
 from pipeline.functional import rigid
 from pipeline.items.views import Crops, Geometry
 from pipeline.route import Query, TemplateView
 from pipeline.spec import Runtime
 from pipeline.stages.crop.square import Square
 from pipeline.stages.extract.coordinates import Coordinates
-from pipeline.stages.fit import Fit, Fitted
 from pipeline.stages.render.raycast import Raycast
 from pipeline.synthetic.objects import make_object
 

@@ -36,15 +36,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pydantic.dataclasses import is_pydantic_dataclass
 
-from pipeline.cache_cli import cache_command
-from pipeline.checkpoints import NotFetched, offline
+from pipeline.cli.cache import cache_command
+from pipeline.cli.score import lint_command, score_command
 from pipeline.errors import BadInput, DzopError
+from pipeline.io.checkpoints import NotFetched, offline
+from pipeline.io.files import write_whole
 from pipeline.route import SecondLook, Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
-from pipeline.score_cli import lint_command, score_command
 from pipeline.spec import build
 from pipeline.store import Store
-from pipeline.whole import write_whole
 
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
 OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method")

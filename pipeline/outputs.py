@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.bop.detections import write_detections
 from pipeline.bop.results import results_name, rows_of, write_results
 from pipeline.graph import Graph, Judged, Retraced, ScoreNodes
+from pipeline.io.files import write_json
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, record_of
 from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, errors_record
@@ -25,7 +26,6 @@ from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
 from pipeline.report.rows import Case, Row, done_row, row_id, row_path, write_row
 from pipeline.report.scores import summary_of
 from pipeline.scoring import dataset_id
-from pipeline.whole import write_json
 
 KEY_DIGITS = 12
 ImageId = tuple[int, int]

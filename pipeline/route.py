@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pipeline.errors import NoPose
+from pipeline.fits import Fit, Fitted, chain
 from pipeline.functional import camera, rigid
 from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
@@ -34,7 +35,6 @@ from pipeline.stages.correspond import Corresponder, SalientCorresponder, TruthC
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import DescribingDetector, Detector
 from pipeline.stages.extract import Extractor
-from pipeline.stages.fit import Fit, Fitted, chain
 from pipeline.stages.fuse import FittedFuser, Fuser, SidedFuser, fused
 from pipeline.stages.lift import lift
 from pipeline.stages.match import FittedMatcher, Matcher, TruthMatcher

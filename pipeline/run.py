@@ -12,16 +12,17 @@ import torch
 from pydantic import Field
 
 from pipeline.bop.dataset import Dataset
-from pipeline.checkpoints import NotFetched
-from pipeline.digests import remember_in
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes, use_threads
+from pipeline.io.checkpoints import NotFetched
+from pipeline.io.digests import remember_in
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Target
 from pipeline.metrics.recall import THETAS
 from pipeline.outputs import KEY_DIGITS, Outputs, now
+from pipeline.progress import Tally, human
 from pipeline.report.rows import Row, done_row, read_rows, row_id, write_row
 from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
@@ -29,7 +30,6 @@ from pipeline.route import Stages
 from pipeline.scoring import Scorer
 from pipeline.spec import NonNegative, PositiveFloat, Runtime, spec
 from pipeline.store import Store
-from pipeline.tally import Tally, human
 
 ROWS_SHOWN = 48  # a longer table goes to poses.json alone; the terminal shows one line per object
 

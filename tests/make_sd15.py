@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from pipeline.stages.extract.loading import empty_model
+from pipeline.backbones.stable_diffusion.loading import empty_model
 from pipeline.stages.extract.random_sd import with_random_weights
 
 VOCABULARY = 49408

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command import heeds_ctrl_c
 
-from pipeline import benchmark
+from benchmarks import accuracy as benchmark
 from pipeline.items.scores import Scores
 from pipeline.report.rows import Row
 
@@ -76,7 +76,7 @@ SMALL = ("dataset.objects=1", "dataset.images=2", "dataset.per_image=1", "render
 
 
 def started(folder: Path, *more: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", "pipeline.benchmark", "--folder", str(folder), "--jobs", "2", *more]
+    command = [sys.executable, "-m", "benchmarks.accuracy", "--folder", str(folder), "--jobs", "2", *more]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, **streams, start_new_session=True, preexec_fn=heeds_ctrl_c)
 

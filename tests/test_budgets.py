@@ -14,12 +14,12 @@ import torch
 from command import Ran, run_dzop
 from huggingface_hub.errors import LocalEntryNotFoundError
 
+from pipeline.backbones.batching import Footprint, fitting_batch
 from pipeline.errors import BadInput
 from pipeline.graph import Graph, Memory
-from pipeline.graph.kept import Kept
+from pipeline.graph.lru import Kept
 from pipeline.graph.plan import Node
 from pipeline.spec import Runtime
-from pipeline.stages.extract.fitting import Footprint, fitting_batch
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
 

@@ -19,10 +19,10 @@ from pipeline.bop.masks import encode
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.graph import Context, Graph
+from pipeline.io.meshes import read_mesh, write_ply
 from pipeline.items.features import CLASS_TOKEN_LAYER, FeatureMaps
 from pipeline.items.poses import NoEstimate
 from pipeline.items.views import Crops, Image, Proposal
-from pipeline.meshes import read_mesh, write_ply
 from pipeline.route import Stages
 from pipeline.spec import Runtime, Spec, spec
 from pipeline.stages.choose.inliers import Inliers

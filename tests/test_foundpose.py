@@ -12,12 +12,12 @@ from tiny_bop import edit_json, write_tiny_bop
 
 from pipeline.__main__ import stages_of
 from pipeline.bop.dataset import open_dataset
+from pipeline.fits import chain
 from pipeline.functional.viewpoints import viewpoint_rotations
 from pipeline.graph import Context, Graph
 from pipeline.spec import Runtime
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
-from pipeline.stages.fit import chain
 from pipeline.store import MemoryStoreConfig, Store
 
 WITH_HOG = ("method=foundpose", "extract=hog", "match.layer=11", "fuse.layers=[11]")

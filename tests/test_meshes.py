@@ -9,8 +9,8 @@ from PIL import Image
 
 from pipeline.errors import BadInput
 from pipeline.functional.shading import texture_colour
+from pipeline.io.meshes import diameter_mm, mesh_digest, read_mesh, write_ply
 from pipeline.items.objects import Mesh
-from pipeline.meshes import diameter_mm, mesh_digest, read_mesh, write_ply
 
 # a unit square in two triangles; the texture has one colour per quarter
 SQUARE = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]], dtype=float)
@@ -155,7 +155,7 @@ def test_a_digest_alone_is_that_of_the_mesh(suffix, tmp_path):
 def test_the_digest_of_a_ply_follows_its_texture_and_parses_nothing(tmp_path, monkeypatch):
     path = ply_with_vertex_uv(tmp_path)
     whole = read_mesh(path).digest
-    monkeypatch.setattr("pipeline.meshes.read_mesh", None)
+    monkeypatch.setattr("pipeline.io.meshes.read_mesh", None)
     assert mesh_digest(path) == whole
     Image.new("RGB", (8, 8)).save(tmp_path / "skin.png")
     assert mesh_digest(path) != whole

@@ -17,9 +17,9 @@ from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
 from pipeline.errors import BadInput
 from pipeline.functional.camera import project
 from pipeline.functional.rigid import transform
+from pipeline.io.meshes import mesh_digest
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.meshes import mesh_digest
 from pipeline.spec import spec
 
 # 0.13 is the most over the targets of LM-O and YCB-V that the tests read; a K of half the size gives 0.9 and more

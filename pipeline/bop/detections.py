@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.bop.masks import runs
+from pipeline.io.files import write_json
 from pipeline.items.views import Detection
-from pipeline.whole import write_json
 
 
 def write_detections(path: Path, detections: Sequence[Detection]) -> None:

@@ -10,7 +10,7 @@ import PIL.Image
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.errors import BadInput
-from pipeline.whole import IMAGE_FORMATS
+from pipeline.io.files import IMAGE_FORMATS
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:

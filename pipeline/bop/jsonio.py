@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import BadInput
-from pipeline.whole import read_file
+from pipeline.io.files import read_file
 
 _PACKED_TIMES, _PACKED_BYTES = 100, 1 << 26
 """JSON unpacks to ten times its size or so; what unpacks to more than 100 times it and 64 MiB is to fill memory."""

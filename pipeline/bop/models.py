@@ -15,8 +15,8 @@ from pipeline.bop.jsonio import brief, by_id, get, is_number, numbers, place, ve
 from pipeline.bop.scene import rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
+from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
-from pipeline.meshes import diameter_mm, read_mesh
 
 MAX_SYMMETRY_STEP = 0.01
 """Largest move of a vertex between neighbouring discretised symmetries, as a share of the diameter (BOP)."""

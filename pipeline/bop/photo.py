@@ -14,9 +14,9 @@ from pipeline.bop.images import image_size, read_rgb
 from pipeline.bop.jsonio import is_number
 from pipeline.bop.scene import Box, check_K, edges
 from pipeline.errors import BadInput
+from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.meshes import diameter_mm, read_mesh
 from pipeline.spec import PositiveFloat, Spec, digest, spec
 
 SCENE_ID, IM_ID = 0, 0

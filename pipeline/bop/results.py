@@ -14,8 +14,8 @@ from jaxtyping import Float
 from pipeline.bop.scene import rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
+from pipeline.io.files import write_whole
 from pipeline.items.poses import PoseEstimate
-from pipeline.whole import write_whole
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _HEADER = ",".join(COLUMNS)

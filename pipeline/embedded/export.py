@@ -11,7 +11,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from pipeline.embedded.training import UNET, VAE, Place
-from pipeline.whole import write_whole
+from pipeline.io.files import write_whole
 
 MOST_BYTES = 25_000_000
 SCHEDULER = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}

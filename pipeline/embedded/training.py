@@ -18,14 +18,15 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torch.utils.data import DataLoader, Dataset
 
+from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
+from pipeline.backbones.stable_diffusion.decoder import decoder_maps, map_shape
+from pipeline.backbones.stable_diffusion.features import clean_latent, network_image
+from pipeline.backbones.stable_diffusion.loading import untrained
 from pipeline.embedded import losses
 from pipeline.embedded.batches import CELLS, PairBatch, Source, pair_batch, picture_batch
 from pipeline.functional.aggregation import Aggregation
 from pipeline.functional.gradients import edge_histograms, with_edges
-from pipeline.stages.extract.decoder import decoder_maps, map_shape
-from pipeline.stages.extract.diffusion import clean_latent, network_image
-from pipeline.stages.extract.embedded import PROMPT, untrained
-from pipeline.stages.extract.weights import alphas_cumprod
+from pipeline.stages.extract.embedded import PROMPT
 
 LAYERS, MATCH_LAYER, DIM, TIMESTEP = (2, 5, 8, 11), 8, 64, 50
 UNET: dict[str, Any] = {

@@ -22,18 +22,18 @@ from typing import Any
 import torch
 
 from pipeline.errors import BadInput
+from pipeline.graph.checks import doubts
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
-from pipeline.graph.doubts import doubts
 from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
 from pipeline.graph.plan import Node, Plan
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
-from pipeline.graph.retrace import Retraced, Retracer
+from pipeline.graph.replay import Retraced, Retracer
 from pipeline.graph.scores import Judged, ScoreNodes
+from pipeline.graph.tasks import Counts, Work, Workers, use_threads
 from pipeline.graph.templates import TemplateNodes
-from pipeline.graph.work import Counts, Work, Workers, use_threads
 from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection

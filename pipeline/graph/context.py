@@ -13,16 +13,16 @@ from jaxtyping import Float
 
 from pipeline.bop.dataset import Dataset
 from pipeline.errors import BadInput, DzopError
-from pipeline.graph.kept import Kept
-from pipeline.graph.rates import Rates, work_of
-from pipeline.graph.work import Advance, Unit, Work, Workers
+from pipeline.graph.lru import Kept
+from pipeline.graph.tasks import Advance, Unit, Work, Workers
+from pipeline.graph.timings import Rates, work_of
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crops, Target
+from pipeline.progress import Tally
 from pipeline.route import Stages
 from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
 from pipeline.store import Layout, Ref, Store, make_ref
-from pipeline.tally import Tally
 
 MESHES_BYTES = 256 << 20
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from pipeline.digests import files_digest
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
+from pipeline.io.digests import files_digest
 from pipeline.items.records import detection_of, detection_record
 from pipeline.items.views import Detection
 from pipeline.spec import digest

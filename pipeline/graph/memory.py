@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 import psutil
 import torch
 
+from pipeline.backbones.batching import SHARE, Footprint, Sized, fitting_batch
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.templates import DRAWN_LARGER
-from pipeline.stages.extract.fitting import SHARE, Footprint, Sized, fitting_batch
+from pipeline.progress import human
 from pipeline.stages.match import FittedMatcher, TruthMatcher
-from pipeline.tally import human
 
 VIEWS_BYTES = 256 << 20  # of whole templates, kept for the next query of their object, where there is a budget
 VIEWS_MOST = 64

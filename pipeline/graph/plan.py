@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from pipeline.checkpoints import NotFetched
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.queries import QueryNodes
-from pipeline.graph.rates import work_of
 from pipeline.graph.templates import TemplateNodes
+from pipeline.graph.timings import work_of
+from pipeline.io.checkpoints import NotFetched
 from pipeline.store import Layout, Ref
 
 TEMPLATE_PIXEL_BYTES = 7  # rgb and float32 depth, before compression

@@ -10,9 +10,9 @@ from functools import cached_property, lru_cache
 from pipeline.errors import NoPose
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import Found, QueryNodes
-from pipeline.graph.rates import work_of
+from pipeline.graph.tasks import Advance, Work
 from pipeline.graph.templates import StoredBank, TemplateNodes
-from pipeline.graph.work import Advance, Work
+from pipeline.graph.timings import work_of
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_of, record_of
 from pipeline.items.views import Detection, Target

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 
 from pipeline.bop.masks import decode
-from pipeline.digests import file_digest
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.descriptors import pooled
 from pipeline.graph.context import Context, ImageId, stacked
+from pipeline.graph.tasks import Advance, Work
 from pipeline.graph.templates import TemplateNodes
-from pipeline.graph.work import Advance, Work
+from pipeline.io.digests import file_digest
 from pipeline.items.records import proposal_of, proposal_record
 from pipeline.items.views import Crops, Proposal
 from pipeline.spec import digest

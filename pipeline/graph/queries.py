@@ -10,13 +10,13 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from pipeline.bop.masks import decode
-from pipeline.digests import file_digest
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.detections import DetectionNodes
-from pipeline.graph.rates import work_of
-from pipeline.graph.work import Advance, Work
+from pipeline.graph.tasks import Advance, Work
+from pipeline.graph.timings import work_of
+from pipeline.io.digests import file_digest
 from pipeline.items.views import Crops, Detection, Geometry
 from pipeline.route import Query
 from pipeline.spec import digest

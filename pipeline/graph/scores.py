@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.bop.results import ResultRow
-from pipeline.digests import files_digest
 from pipeline.graph.context import Context
 from pipeline.graph.plan import Node
 from pipeline.graph.poses import PoseNodes
-from pipeline.graph.retrace import Retracer
+from pipeline.graph.replay import Retracer
 from pipeline.graph.templates import TemplateNodes
+from pipeline.io.digests import files_digest
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors, TemplateError, errors_of, errors_record, scores_of, scores_record

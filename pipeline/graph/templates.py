@@ -12,17 +12,17 @@ import torch
 from jaxtyping import Float
 
 from pipeline.errors import DzopError
+from pipeline.fits import Fit, Fitted, chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
 from pipeline.functional.resample import resample
 from pipeline.functional.rigid import rigid
 from pipeline.graph.context import Context, stacked
-from pipeline.graph.rates import work_of
-from pipeline.graph.work import Advance, Work
+from pipeline.graph.tasks import Advance, Work
+from pipeline.graph.timings import work_of
 from pipeline.items.features import TemplateCells
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.route import TemplateView
 from pipeline.stages.crop import HALF
-from pipeline.stages.fit import Fit, Fitted, chain, foreground_cells
 from pipeline.store import Layout, Ref, make_ref
 
 VIEWS_PER_BATCH = 8

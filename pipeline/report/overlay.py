@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.functional.camera import project, resize_affine
 from pipeline.functional.rigid import transform
+from pipeline.io.files import write_whole
 from pipeline.items.objects import Mesh
 from pipeline.items.views import Image
 from pipeline.stages.render.raycast import render_depth
-from pipeline.whole import write_whole
 
 Role = Literal["truth", "correct", "wrong", "unchecked"]
 Colour = tuple[int, int, int]

@@ -16,13 +16,13 @@ import jinja2
 import PIL.Image
 from markupsafe import Markup, escape
 
+from pipeline.io.files import write_whole
 from pipeline.items.scores import Scores
 from pipeline.report import figures, tables
 from pipeline.report.families import Family, base_of, families, is_oracle, scored_by
 from pipeline.report.figures import Figure, ar_interval, ar_name
 from pipeline.report.rows import Row, standing_failures
 from pipeline.report.tables import Table, run_name
-from pipeline.whole import write_whole
 
 FOLDER = "report"
 PICTURES_BYTES = 9_000_000

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.errors import BadInput
+from pipeline.io.files import write_json
 from pipeline.items.scores import DatasetId, Scores, TemplateError, scores_of, scores_record
 from pipeline.spec import digest
-from pipeline.whole import write_json
 
 FORMAT = 1
 FOLDER = "rows"

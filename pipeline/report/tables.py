@@ -14,11 +14,11 @@ from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import Interval, image_index, paired_interval
 from pipeline.metrics.recall import instance_ar, instance_recalls
 from pipeline.metrics.template_error import ACC_DEG
+from pipeline.progress import human
 from pipeline.report import published
 from pipeline.report.families import Family, difference, is_oracle, settings
 from pipeline.report.figures import ar_head, ar_interval, value_text
 from pipeline.report.rows import Row
-from pipeline.tally import human
 
 NONE = "n/a"
 READINGS = ("geodesic", "direction", "vectorised")

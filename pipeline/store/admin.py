@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from pipeline.errors import BadInput
+from pipeline.store.completion import completeness
 from pipeline.store.entries import DamagedEntry, Store
 from pipeline.store.keys import Ref, make_ref
-from pipeline.store.seal import completeness
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
 from pipeline.errors import BadInput, DzopError
 from pipeline.spec import PositiveFloat, Spec, spec
-from pipeline.store.answering import Answering, told
+from pipeline.store.remote import Answering, told
 
 Announce = Callable[[str], None]
 

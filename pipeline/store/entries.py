@@ -27,8 +27,8 @@ from pipeline.errors import DzopError
 from pipeline.spec import canonical
 from pipeline.store.backends import Backend, StoreConfig
 from pipeline.store.chunks import plain, read_rows
+from pipeline.store.completion import completeness, finished, identity, metadata_digest
 from pipeline.store.keys import Ref
-from pipeline.store.seal import completeness, finished, identity, metadata_digest
 
 _WRITE_ZEROS: Any = {"write_empty_chunks": True}
 _UNREADABLE = (BaseZarrError, ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError, IsADirectoryError)

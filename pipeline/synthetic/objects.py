@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.functional.viewpoints import unit_sphere
+from pipeline.io.meshes import diameter_mm
 from pipeline.items.objects import Mesh
-from pipeline.meshes import diameter_mm
 from pipeline.synthetic.parts import (
     Rng,
     Shape,

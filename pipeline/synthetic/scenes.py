@@ -15,8 +15,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from pipeline.errors import BadInput
+from pipeline.io.meshes import diameter_mm, write_ply
 from pipeline.items.objects import Mesh
-from pipeline.meshes import diameter_mm, write_ply
 from pipeline.synthetic.arranging import Camera, Rng, Thing, arrange, nominal_K, random_camera, visible_parts
 from pipeline.synthetic.objects import make_object
 from pipeline.synthetic.photographs import Wall, photograph

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from ground import Ground, Undisturbed, undisturbed
+from helpers import Ground, Undisturbed, undisturbed
 from make_sam import write_sam
 
 from pipeline.synthetic.scenes import write_dataset

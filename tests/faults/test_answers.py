@@ -10,7 +10,7 @@ from zarr.storage import LocalStore, WrapperStore
 from pipeline.errors import DzopError
 from pipeline.store import Layout, LocalStoreConfig, Store, make_ref
 from pipeline.store.admin import entries, verify
-from pipeline.store.answering import Answering, StoreUnreachable
+from pipeline.store.remote import Answering, StoreUnreachable
 
 REF = make_ref("features/toy", {"kind": "toy", "version": 1}, {})
 DOCUMENT = make_ref("runs", {"kind": "toy run", "version": 1}, {})

@@ -5,9 +5,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from ground import KINDS, Ended, Ground, Undisturbed, store_of, stored, written
+from helpers import KINDS, Ended, Ground, Undisturbed, store_of, stored, written
 
-from pipeline.cache_cli import cache_command
+from pipeline.cli.cache import cache_command
 from pipeline.errors import DzopError
 from pipeline.store import DamagedEntry
 from pipeline.store.admin import entries, verify

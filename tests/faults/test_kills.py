@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from ground import STEPS, Ground, Undisturbed, stored, written
+from helpers import STEPS, Ground, Undisturbed, stored, written
 
 
 @pytest.mark.timeout(3000)

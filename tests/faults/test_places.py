@@ -8,11 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from ground import Ground, Undisturbed, store_of, stored, written
+from helpers import Ground, Undisturbed, store_of, stored, written
 
-import pipeline.digests
-import pipeline.store.seal
-from pipeline.digests import file_digest, remember_in
+import pipeline.io.digests
+import pipeline.store.completion
+from pipeline.io.digests import file_digest, remember_in
 from pipeline.store.admin import collect, entries
 
 
@@ -137,7 +137,7 @@ def test_entries_completed_in_the_future_are_not_old(quiet: Undisturbed, folder:
     quiet.copy(folder, quiet.after["onboard"])
     store = store_of(folder)
     row = entries(store)[0]
-    monkeypatch.setattr(pipeline.store.seal, "datetime", Later)
+    monkeypatch.setattr(pipeline.store.completion, "datetime", Later)
     ref = pipeline.store.make_ref("later", {"kind": "later"}, {})
     store.put_document(ref, {}, rows=1)
     monkeypatch.undo()
@@ -148,7 +148,7 @@ def test_entries_completed_in_the_future_are_not_old(quiet: Undisturbed, folder:
 
 
 def test_a_file_that_was_changed_while_the_clock_stood_still_has_another_digest(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(pipeline.digests, "_LARGE", 1)
+    monkeypatch.setattr(pipeline.io.digests, "_LARGE", 1)
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"one")
     remember_in(tmp_path / "memo")

@@ -4,7 +4,7 @@ import random
 from pathlib import Path
 
 import pytest
-from ground import Ground, Undisturbed, stored, written
+from helpers import Ground, Undisturbed, stored, written
 
 
 @pytest.mark.timeout(3000)

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.bop.models import read_models_info
 from pipeline.functional.rigid import rigid
-from pipeline.meshes import read_mesh
+from pipeline.io.meshes import read_mesh
 from pipeline.metrics.matching import best_scored, match
 from pipeline.metrics.pose_error import add, adi, hull_vertices, mspd, mssd, rotation_error_deg, translation_error_mm
 from pipeline.metrics.vsd import vsd

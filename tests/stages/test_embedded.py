@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.backbones.batching import maps_bytes
 from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
 from pipeline.stages.extract.embedded import Embedded
-from pipeline.stages.extract.fitting import maps_bytes
 from pipeline.stages.fuse.auto import Auto
 from pipeline.stages.fuse.learned import Learned
 from pipeline.stages.fuse.pca import Pca

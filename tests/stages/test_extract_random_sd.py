@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.backbones.stable_diffusion.features import network_image
+from pipeline.backbones.stable_diffusion.noise import draw, noised
 from pipeline.errors import BadInput
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
-from pipeline.stages.extract.diffusion import network_image
-from pipeline.stages.extract.noise import draw, noised
 from pipeline.stages.extract.random_sd import RandomSD
 
 CPU = Runtime(device="cpu", batch=8)

@@ -13,12 +13,12 @@ from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from make_sd15 import unet_config, write_folder
 from transformers import CLIPTextModel
 
+from pipeline.backbones.stable_diffusion.decoder import decoder_maps, map_shape
+from pipeline.backbones.stable_diffusion.features import DiffusionBackbone
 from pipeline.errors import BadInput
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
-from pipeline.stages.extract.decoder import decoder_maps, map_shape
-from pipeline.stages.extract.diffusion import DiffusionBackbone
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
 LAYERS = range(12)

@@ -14,6 +14,9 @@ from make_sd15 import write_folder
 from make_vit import CLASS, HEADS, PATCH, REGISTERS, WIDTH, write_vit
 from safetensors.torch import load_file, save_file
 
+from pipeline.backbones.vit.features import VitFeatures
+from pipeline.backbones.vit.source import Architecture
+from pipeline.backbones.vit.transformer import framed, position_grid
 from pipeline.errors import BadInput
 from pipeline.functional import camera
 from pipeline.functional.binning import log_binned
@@ -22,9 +25,6 @@ from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.dino import Dino
 from pipeline.stages.extract.dinov2 import DinoV2
-from pipeline.stages.extract.transformer import framed, position_grid
-from pipeline.stages.extract.transformers_folder import Architecture
-from pipeline.stages.extract.vit import VitFeatures
 
 DEPTH = 3
 BLOCKS = range(DEPTH)

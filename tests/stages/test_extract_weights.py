@@ -11,11 +11,12 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from make_sd15 import write_folder
 from safetensors.torch import load_file, save_file
 
-from pipeline.checkpoints import is_local
+from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
+from pipeline.backbones.stable_diffusion.source import find
 from pipeline.errors import BadInput
+from pipeline.io.checkpoints import is_local
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
-from pipeline.stages.extract.weights import alphas_cumprod, find
 
 CPU = Runtime(device="cpu", batch=2)
 UNET = "unet/diffusion_pytorch_model.safetensors"

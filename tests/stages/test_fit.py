@@ -5,11 +5,11 @@ from sklearn.decomposition import PCA
 from sklearn.feature_extraction.text import TfidfTransformer
 
 from pipeline.errors import DzopError
+from pipeline.fits import chain, fitted_to, foreground_cells
+from pipeline.fits.projection import Projection, on_axes
 from pipeline.functional.masks import cell_mask
 from pipeline.items.features import TemplateCells
 from pipeline.spec import digest
-from pipeline.stages.fit import chain, fitted_to, foreground_cells
-from pipeline.stages.fit.projection import Projection, on_axes
 from pipeline.stages.fuse.template_pca import TemplatePca
 from pipeline.stages.match.words import Words
 

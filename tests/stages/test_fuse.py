@@ -6,9 +6,9 @@ import torch
 from sklearn.decomposition import PCA
 
 from pipeline.errors import BadInput, NoPose
+from pipeline.fits import fitted_to, foreground_cells
 from pipeline.functional.masks import cell_mask
 from pipeline.spec import build
-from pipeline.stages.fit import fitted_to, foreground_cells
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.pca import Pca
 from pipeline.stages.fuse.template_pca import TemplatePca

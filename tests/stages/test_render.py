@@ -14,8 +14,8 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import project, unproject
 from pipeline.functional.rigid import inverse, look_at, transform
 from pipeline.functional.viewpoints import unit_sphere
+from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import Mesh
-from pipeline.meshes import diameter_mm, read_mesh
 from pipeline.spec import build
 from pipeline.stages.render.auto import Auto
 from pipeline.stages.render.pyrender import Pyrender

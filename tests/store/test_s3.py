@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.errors import BadInput
 from pipeline.store import DamagedEntry, S3StoreConfig, Store
-from pipeline.store.answering import StoreUnreachable
+from pipeline.store.remote import StoreUnreachable
 from tests.store.test_entries import LAYOUT, REF, ROWS, compute, fill, values
 
 CHUNK = f"cache/{REF.path}/maps/c/3/0/0"

@@ -4,7 +4,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from pipeline.functional.viewpoints import superfibonacci
-from pipeline.meshes import diameter_mm
+from pipeline.io.meshes import diameter_mm
 from pipeline.synthetic.objects import DIAMETERS_MM, FAMILIES, make_object
 
 SEEDS = range(2 * len(FAMILIES))

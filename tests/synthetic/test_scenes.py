@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput
-from pipeline.meshes import diameter_mm, read_mesh
+from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.stages.render.raycast import render_depth
 from pipeline.synthetic.arranging import OCCLUDED
 from pipeline.synthetic.demo import DemoConfig

@@ -12,9 +12,9 @@ from pipeline.bop.dataset import Dataset
 from pipeline.bop.jsonio import brief, get, integer, is_number, place, read_json
 from pipeline.bop.masks import area, decode, read_rle
 from pipeline.bop.scene import Box, edges
-from pipeline.digests import file_digest
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
+from pipeline.io.digests import file_digest
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Positive, Spec, spec
 from pipeline.stages.detect.annotated import photographs

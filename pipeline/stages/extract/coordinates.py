@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from pydantic import Field
 
+from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.grid import CELLS, cells_of
 from pipeline.errors import BadInput
 from pipeline.functional import camera, rigid
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import NonNegative, PositiveFloat, Runtime, Spec, spec
-from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
-from pipeline.stages.extract.grid import CELLS, cells_of
 
 FINEST = max(CELLS.values())
 

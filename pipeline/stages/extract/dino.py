@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from pipeline.backbones.vit.features import VitFeatures
 from pipeline.spec import NonNegative, spec
-from pipeline.stages.extract.vit import VitFeatures
 
 
 @spec

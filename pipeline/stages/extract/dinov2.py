@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from pipeline.backbones.vit.features import VitFeatures
+from pipeline.backbones.vit.transformer import Facet
 from pipeline.spec import Positive, spec
-from pipeline.stages.extract.transformer import Facet
-from pipeline.stages.extract.vit import VitFeatures
 
 
 @spec

@@ -17,17 +17,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.digests import file_digest
+from pipeline.backbones.batching import Footprint, maps_bytes
+from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
+from pipeline.backbones.stable_diffusion.features import Architecture, DiffusionBackbone, DiffusionFeatures, LoadedModel
+from pipeline.backbones.stable_diffusion.loading import empty_encoder, empty_unet
+from pipeline.backbones.stable_diffusion.noise import NoiseMode
 from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES, ORIENTATIONS, edge_histograms
+from pipeline.io.digests import file_digest
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, digest, spec
-from pipeline.stages.extract.diffusion import Architecture, DiffusionBackbone, DiffusionFeatures, LoadedModel
-from pipeline.stages.extract.fitting import Footprint, maps_bytes
-from pipeline.stages.extract.loading import empty_model, without_decoder
-from pipeline.stages.extract.noise import NoiseMode
-from pipeline.stages.extract.weights import alphas_cumprod
 
 FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
 PROMPT = (1, 1, 32)  # of zeros: the model knows no text
@@ -88,11 +88,9 @@ class Embedded(DiffusionFeatures):
 
     def load_model(self) -> LoadedModel:
         """The shipped weights, float16 on disk."""
-        from diffusers import AutoencoderKL, UNet2DConditionModel
-
         a, dtype = self.architecture(), getattr(torch, self.dtype)
-        unet = _filled(empty_model(UNet2DConditionModel, a.unet, dtype), FOLDER / f"unet_{self.weights}.safetensors")
-        vae = without_decoder(empty_model(AutoencoderKL, a.vae, dtype))
+        unet = _filled(empty_unet(a.unet, dtype), FOLDER / f"unet_{self.weights}.safetensors")
+        vae = empty_encoder(a.vae, dtype)
         return LoadedModel(unet, _filled(vae, FOLDER / "vae.safetensors"), torch.zeros(PROMPT, dtype=dtype))
 
     def _digest(self) -> str:
@@ -129,13 +127,6 @@ def shipped_config() -> dict[str, Any]:
     if not path.exists():
         raise BadInput(path, found="nothing", needed="the embedded model (make train-embedded), or another extract")
     return dict(json.loads(path.read_text()))
-
-
-def untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
-    """U-Net and autoencoder of the given configs, freshly initialised: for training."""
-    from diffusers import AutoencoderKL, UNet2DConditionModel
-
-    return UNet2DConditionModel(**unet), AutoencoderKL(**vae)
 
 
 @lru_cache(maxsize=8)

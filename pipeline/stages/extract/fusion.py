@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, PlainValidator
 
+from pipeline.backbones.batching import Footprint, Sized, maps_bytes
 from pipeline.errors import BadInput
 from pipeline.functional.maps import side_by_side
 from pipeline.items.features import FeatureMaps
@@ -16,7 +17,6 @@ from pipeline.items.views import Crops
 from pipeline.spec import Fraction, Runtime, Spec, spec
 from pipeline.stages.extract import Backbone, Extractor
 from pipeline.stages.extract.dinov2 import DinoV2
-from pipeline.stages.extract.fitting import Footprint, Sized, maps_bytes
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.grid import CELLS, cells_of
 from pipeline.functional.gradients import cell_means, oriented_energy, smoothed, with_context
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, Spec, spec
-from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
-from pipeline.stages.extract.grid import CELLS, cells_of
 
 _CROP_PX = 256  # a batch is sized for crops of this side
 

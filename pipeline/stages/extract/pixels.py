@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate, pixel_unshuffle
 
+from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.grid import CELLS, cells_of
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, Spec, spec
-from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
-from pipeline.stages.extract.grid import CELLS, cells_of
 
 _CROP_PX = 256  # a batch is sized for crops of this side
 

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
+from pipeline.backbones.stable_diffusion.features import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.backbones.stable_diffusion.loading import empty_encoder, empty_unet
 from pipeline.spec import NonNegative, Positive, digest, spec
-from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
-from pipeline.stages.extract.loading import empty_model, without_decoder
-from pipeline.stages.extract.weights import alphas_cumprod
 
 _PROMPT_TOKENS = 77
 _GROUPS = 8  # of every group norm
@@ -60,11 +60,9 @@ class RandomSD(DiffusionFeatures):
 
     def load_model(self) -> LoadedModel:
         """The same weights on every machine and in every run."""
-        from diffusers import AutoencoderKL, UNet2DConditionModel
-
         a, dtype = self.architecture(), getattr(torch, self.dtype)
-        unet = with_random_weights(empty_model(UNet2DConditionModel, a.unet, dtype), seed=self.weights_seed)
-        vae = with_random_weights(without_decoder(empty_model(AutoencoderKL, a.vae, dtype)), seed=self.weights_seed)
+        unet = with_random_weights(empty_unet(a.unet, dtype), seed=self.weights_seed)
+        vae = with_random_weights(empty_encoder(a.vae, dtype), seed=self.weights_seed)
         prompt = _gaussian("prompt", (1, _PROMPT_TOKENS, self.cross_attention_dim), seed=self.weights_seed)
         return LoadedModel(unet, vae, prompt.to(dtype))
 

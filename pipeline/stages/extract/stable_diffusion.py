@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 import torch
 
-from pipeline.digests import files_digest
+from pipeline.backbones.stable_diffusion.features import Architecture, DiffusionFeatures, LoadedModel
+from pipeline.backbones.stable_diffusion.source import Weights, find
+from pipeline.io.digests import files_digest
 from pipeline.spec import spec
-from pipeline.stages.extract.diffusion import Architecture, DiffusionFeatures, LoadedModel
-from pipeline.stages.extract.weights import Weights, find
 
 
 @spec

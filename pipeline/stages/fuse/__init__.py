@@ -11,10 +11,10 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.errors import NoPose
+from pipeline.fits import Fit, Fitted
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.items.features import FusedPair
 from pipeline.spec import NonNegative, Variant
-from pipeline.stages.fit import Fit, Fitted
 
 Layers = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 

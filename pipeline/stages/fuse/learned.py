@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.digests import file_digest
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
 from pipeline.functional.gradients import EDGES, with_edges
+from pipeline.io.digests import file_digest
 from pipeline.items.features import FusedPair
 from pipeline.spec import PositiveFloat, Spec, spec
 from pipeline.stages.fuse import Layers, fused

@@ -11,10 +11,10 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.errors import NoPose
+from pipeline.fits import Fitted, fitted_to, foreground_cells
+from pipeline.fits.projection import Projection, on_axes
 from pipeline.items.features import FusedPair
 from pipeline.spec import NonNegative, Positive, Spec, spec
-from pipeline.stages.fit import Fitted, fitted_to, foreground_cells
-from pipeline.stages.fit.projection import Projection, on_axes
 from pipeline.stages.fuse import fused
 
 

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.errors import NoPose
+from pipeline.fits import Fit, Fitted
 from pipeline.items.matches import TemplateMatch
 from pipeline.spec import Variant
-from pipeline.stages.fit import Fit, Fitted
 
 
 class Matcher(Variant, Protocol):

@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.errors import NoPose
+from pipeline.fits import Fitted, fitted_to, foreground_cells
+from pipeline.fits.projection import Projection
+from pipeline.fits.vocabulary import Vocabulary
 from pipeline.functional.masks import cell_mask
 from pipeline.functional.pca import projected
 from pipeline.items.matches import TemplateMatch
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
-from pipeline.stages.fit import Fitted, fitted_to, foreground_cells
-from pipeline.stages.fit.projection import Projection
-from pipeline.stages.fit.vocabulary import Vocabulary
 from pipeline.stages.match import ranked
 
 

@@ -15,14 +15,14 @@ from PIL import Image as Picture
 from pydantic import Field
 from torch import Tensor
 
+from pipeline.backbones.sam import SamWeights, find
 from pipeline.bop.masks import encode
-from pipeline.checkpoints import tensor_shapes
-from pipeline.digests import files_digest
 from pipeline.functional.boxes import area, not_suppressed
 from pipeline.functional.camera import mask_bbox
+from pipeline.io.checkpoints import tensor_shapes
+from pipeline.io.digests import files_digest
 from pipeline.items.views import Image, Proposal
 from pipeline.spec import Fraction, Positive, PositiveFloat, Runtime, Spec, spec
-from pipeline.stages.detect.proposals.sam_weights import SamWeights, find
 
 POINTS_PER_BATCH = 64
 _MEAN, _STD = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32)  # of ImageNet

@@ -22,18 +22,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.checkpoints import tensor_shapes
-from pipeline.digests import files_digest
+from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.determinism import exact_convolutions
+from pipeline.backbones.stable_diffusion.features import network_image
+from pipeline.backbones.vit.source import Architecture, TransformersFolder, find
+from pipeline.backbones.vit.transformer import Facet, block_tokens, embedded, framed, standardised
 from pipeline.errors import BadInput
 from pipeline.functional.binning import bin_count, log_binned
+from pipeline.io.checkpoints import tensor_shapes
+from pipeline.io.digests import files_digest
 from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
-from pipeline.stages.extract.diffusion import network_image
-from pipeline.stages.extract.exact import exact_convolutions
-from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
-from pipeline.stages.extract.transformer import Facet, block_tokens, embedded, framed, standardised
-from pipeline.stages.extract.transformers_folder import Architecture, TransformersFolder, find
 
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
 _LIVE_MAPS = 24  # maps as wide as the model that are alive at once in a block: projections, attention, its MLP

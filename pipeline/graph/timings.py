@@ -15,9 +15,9 @@ from pathlib import Path
 
 import torch
 
+from pipeline.io.files import write_json
 from pipeline.route import ONLINE_STAGES, Stages
 from pipeline.spec import digest
-from pipeline.whole import write_json
 
 FOLDER = ".rates"
 

@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.checkpoints import check_missing, tensor_shapes
-from pipeline.errors import BadInput
-from pipeline.stages.extract.diffusion import Architecture
-from pipeline.stages.extract.loading import (
+from pipeline.backbones.stable_diffusion.configs import alphas_cumprod, check_latents
+from pipeline.backbones.stable_diffusion.features import Architecture
+from pipeline.backbones.stable_diffusion.loading import (
     copy_weight,
     empty_model,
     empty_prompt,
@@ -25,7 +24,8 @@ from pipeline.stages.extract.loading import (
     last_hidden_state,
     without_decoder,
 )
-from pipeline.stages.extract.weights import alphas_cumprod, check_latents
+from pipeline.errors import BadInput
+from pipeline.io.checkpoints import check_missing, tensor_shapes
 
 Shapes = Mapping[str, tuple[int, ...]]
 

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import nn
 
-from pipeline.checkpoints import everywhere, fetched, is_local, pickled_in, read_json, shards
+from pipeline.backbones.pretrained import load_pretrained, quiet_libraries, whole_text
 from pipeline.errors import BadInput
-from pipeline.stages.extract.weights import FIELD
-from pipeline.stages.pretrained import load_pretrained, quiet_libraries, whole_text
+from pipeline.io.checkpoints import everywhere, fetched, is_local, pickled_in, read_json, shards
 
+FIELD = "extract.weights"
 CLASSES = {
     "vit": "ViTModel",
     "dinov2": "Dinov2Model",

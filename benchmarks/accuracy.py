@@ -152,7 +152,7 @@ def _shown(value: float | None) -> str:
 
 def main() -> None:
     """Parse, run, print."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline.benchmark", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy", description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path("cache/benchmark"), help="data, cache and results")
     parser.add_argument("--lmo", type=Path, help="folder of LM-O, for the same table on photographs")
     parser.add_argument("--detections", type=Path, help="a detector's json for LM-O, for the table once more")

@@ -9,8 +9,8 @@ from typing import Any
 
 from torch import nn
 
-from pipeline.checkpoints import check_missing, tensor_shapes
 from pipeline.errors import BadInput
+from pipeline.io.checkpoints import check_missing, tensor_shapes
 
 
 def load_pretrained(class_name: str, root: Path, tensors: Sequence[Path], **options: Any) -> nn.Module:

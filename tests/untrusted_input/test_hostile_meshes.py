@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline.errors import BadInput
-from pipeline.meshes import SUFFIXES, read_mesh
+from pipeline.io.meshes import SUFFIXES, read_mesh
 
 MILLIONS = 50_000_000
 PLY = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"

@@ -11,16 +11,16 @@ from pathlib import Path
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.lint import lint
 from pipeline.bop.results import ResultRow, name_parts, read_results
-from pipeline.digests import file_digest
 from pipeline.errors import BadInput, DzopError
+from pipeline.io.digests import file_digest
+from pipeline.io.files import write_json
 from pipeline.metrics.bootstrap import Interval, image_index, paired_interval
 from pipeline.metrics.recall import instance_ar
+from pipeline.progress import Tally
 from pipeline.report.rows import Row, write_row
 from pipeline.report.scores import scores_table, summary_of
 from pipeline.scoring import VSD_DELTA_MM, Scored, Scorer, dataset_id
 from pipeline.spec import digest
-from pipeline.tally import Tally
-from pipeline.whole import write_json
 
 TARGETS = "test_targets_bop19.json"
 FAULTS_SHOWN = 20

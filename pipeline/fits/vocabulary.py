@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.fits import Fit, Fitted
+from pipeline.fits.projection import Projection
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.pca import projected
 from pipeline.functional.similarity import unit
 from pipeline.functional.tfidf import inverse_frequency, nearest_words, soft_weights, word_counts
 from pipeline.items.features import TemplateCells
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
-from pipeline.stages.fit import Fit, Fitted
-from pipeline.stages.fit.projection import Projection
 
 
 @spec

@@ -8,9 +8,9 @@ from collections import defaultdict
 from pathlib import Path
 
 from pipeline.errors import DzopError
+from pipeline.progress import human
 from pipeline.store import LocalStoreConfig, S3StoreConfig, Store
 from pipeline.store.admin import Row, collect, entries, find, verify
-from pipeline.tally import human
 
 
 def cache_command(arguments: list[str]) -> None:

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.errors import DzopError
+from pipeline.fits import Fit, Fitted
 from pipeline.functional.pca import principal_axes_in_blocks, projected
 from pipeline.items.features import TemplateCells
 from pipeline.spec import NonNegative, Positive, Spec, spec
-from pipeline.stages.fit import Fit, Fitted
 
 
 @spec

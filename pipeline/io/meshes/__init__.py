@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Float, Int, Num, UInt8
 from PIL import Image
 
-from pipeline.digests import files_digest
 from pipeline.errors import BadInput
+from pipeline.io.digests import files_digest
+from pipeline.io.files import IMAGE_FORMATS, read_file
 from pipeline.items.objects import Mesh
-from pipeline.whole import IMAGE_FORMATS, read_file
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

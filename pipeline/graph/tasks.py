@@ -14,7 +14,7 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
-from pipeline.tally import Count
+from pipeline.progress import Count
 
 Unit = TypeVar("Unit", bound=Hashable)
 Advance = Callable[[int], None]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.checkpoints import everywhere, fetched, is_local, read_json
+from pipeline.backbones.pretrained import load_pretrained
 from pipeline.errors import BadInput
-from pipeline.stages.pretrained import load_pretrained
+from pipeline.io.checkpoints import everywhere, fetched, is_local, read_json
 
 FIELD = "detect.proposals.weights"
 _NAME = "sam"  # below weights in the configuration

@@ -17,14 +17,14 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.determinism import exact_convolutions
+from pipeline.backbones.stable_diffusion.decoder import Hook, block_count, decoder_maps, map_shape
+from pipeline.backbones.stable_diffusion.noise import NoiseMode, draw, noised
 from pipeline.errors import BadInput
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
-from pipeline.stages.extract.decoder import Hook, block_count, decoder_maps, map_shape
-from pipeline.stages.extract.exact import exact_convolutions
-from pipeline.stages.extract.fitting import Footprint, fitting_batch, maps_bytes
-from pipeline.stages.extract.noise import NoiseMode, draw, noised
 
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
 

@@ -1,21 +1,25 @@
-"""Weights of Stable Diffusion: found, and their configs checked. safetensors only; nothing is ever unpickled."""
+"""A diffusers folder, local or fetched from the hub -> the parts of Stable Diffusion. Only safetensors are read."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.checkpoints import everywhere, fetched, is_local, one_line, pickled_in, read_json, shards
-from pipeline.errors import BadInput
-from pipeline.stages.extract.diffusion import Architecture
-from pipeline.stages.extract.loading import (
+from pipeline.backbones.stable_diffusion.configs import (
+    alphas_cumprod,
+    check_class,
+    check_fields,
+    check_latents,
+    check_unet,
+)
+from pipeline.backbones.stable_diffusion.features import Architecture
+from pipeline.backbones.stable_diffusion.loading import (
     empty_model,
     empty_prompt,
     empty_text_encoder,
@@ -23,55 +27,13 @@ from pipeline.stages.extract.loading import (
     last_hidden_state,
     without_decoder,
 )
+from pipeline.errors import BadInput
+from pipeline.io.checkpoints import fetched, one_line, pickled_in, read_json, shards
 
 FIELD = "extract.weights"
-_NAME = "stable_diffusion"  # below weights in the configuration
-_SCHEDULE = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
-_SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
+NAME = "stable_diffusion"  # below weights in the configuration
 _TOKENIZER_FILES = ("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
 _STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
-
-
-class Weights(Protocol):
-    """A place that holds a Stable Diffusion model. ``files``: all that is read from it, by name."""
-
-    @property
-    def files(self) -> dict[str, Path]:
-        """The files whose bytes decide the features."""
-        ...
-
-    def architecture(self) -> Architecture:
-        """Configs, checked to be Stable Diffusion 1.x or 2.x. Raises BadInput."""
-        ...
-
-    def unet(self, dtype: torch.dtype) -> nn.Module:
-        """The U-Net. Raises BadInput for weights that do not fit the config."""
-        ...
-
-    def vae(self, dtype: torch.dtype) -> nn.Module:
-        """The VAE, its decoder dropped. Raises BadInput as ``unet`` does."""
-        ...
-
-    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
-        """The text encoder's last hidden state, float32; the encoder is freed. Raises BadInput as ``unet`` does."""
-        ...
-
-
-def find(weights: str, revision: str | None) -> Weights:
-    """What lies at a hub id, in a diffusers folder, or in one .safetensors file of the original layout."""
-    from pipeline.stages.extract.single_file import SingleFile
-
-    if not is_local(weights):
-        return DiffusersFolder(_download(weights, revision))
-    path = Path(weights).expanduser()
-    if not path.exists():
-        needed = "a diffusers folder or a .safetensors file" + everywhere(_NAME)
-        raise BadInput(FIELD, found=f"{weights!r}, which does not exist", needed=needed)
-    if path.is_dir():
-        return DiffusersFolder(path)
-    if path.suffix != ".safetensors":
-        raise BadInput(FIELD, found=f"{weights!r}", needed="safetensors: convert it, pickled weights are never opened")
-    return SingleFile(path)
 
 
 @dataclass(frozen=True)
@@ -176,61 +138,10 @@ class DiffusersFolder:
         return model
 
 
-def check_unet(config: Mapping[str, Any], where: Path) -> None:
-    """Raises BadInput, naming the field, for a U-Net that is not that of Stable Diffusion 1.x or 2.x."""
-    check_class(config, "UNet2DConditionModel", where)
-    for name in ("addition_embed_type", "class_embed_type", "encoder_hid_dim_type"):
-        if config.get(name) is not None:
-            raise BadInput(
-                where, found=f"{name} {config[name]!r}", needed="none, as Stable Diffusion 1.x and 2.x have it"
-            )
-    check_fields(config, ("block_out_channels", "layers_per_block", "cross_attention_dim"), where)
-    for name in ("layers_per_block", "cross_attention_dim"):
-        if not isinstance(config[name], int):
-            raise BadInput(where, found=f"{name} {config[name]!r}", needed="one whole number")
-    if strange := sorted(set(config.get("up_block_types", ())) - {"UpBlock2D", "CrossAttnUpBlock2D"}):
-        raise BadInput(where, found=f"up_block_types {strange[0]!r}", needed="UpBlock2D or CrossAttnUpBlock2D")
-
-
-def check_class(config: Mapping[str, Any], name: str, where: Path) -> None:
-    """Raises BadInput when a config belongs to another class."""
-    if config.get("_class_name") != name:
-        raise BadInput(where, found=f"_class_name {config.get('_class_name')!r}", needed=name)
-
-
-def check_fields(config: Mapping[str, Any], names: Sequence[str], where: Path) -> None:
-    """Raises BadInput when a config lacks a field."""
-    for name in names:
-        if not config.get(name):
-            raise BadInput(where, found=f"no {name}", needed=f"the config of a {config['_class_name']}")
-
-
-def check_latents(unet: Mapping[str, Any], vae: Mapping[str, Any], where: Path) -> None:
-    """Raises BadInput for a U-Net that takes more than a latent: inpainting, depth, editing, upscaling."""
-    needed = int(vae.get("latent_channels", 4))
-    if unet.get("in_channels", 4) != needed:
-        found = f"in_channels {unet['in_channels']}"
-        raise BadInput(where, found=found, needed=f"{needed}, the latent alone (no inpainting or depth model)")
-
-
-def alphas_cumprod(scheduler: Mapping[str, Any], where: Path | None = None) -> Float[np.ndarray, " timesteps"]:
-    """abar_t of a scheduler's config; Stable Diffusion's scaled-linear betas for what it leaves open."""
-    from diffusers import DDPMScheduler
-
-    if "Flow" in str(scheduler.get("_class_name", "")):
-        raise BadInput(where, found=f"_class_name {scheduler['_class_name']!r}", needed="a scheduler with betas")
-    schedule = _SCHEDULE | {name: scheduler[name] for name in _SCHEDULE_FIELDS if scheduler.get(name) is not None}
-    try:
-        ddpm: Any = DDPMScheduler(**schedule)
-        return ddpm.alphas_cumprod.double().numpy()
-    except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
-        raise BadInput(where, found=one_line(error), needed="a schedule of betas that diffusers knows") from None
-
-
-def _download(hub_id: str, revision: str | None) -> Path:
+def download(hub_id: str, revision: str | None) -> Path:
     """Folder of the hub's files that are needed; the half-precision ones only where there are no others."""
     for variant in ("", ".fp16"):
-        folder = fetched(hub_id, revision, _patterns(variant), field=FIELD, name=_NAME)
+        folder = fetched(hub_id, revision, _patterns(variant), field=FIELD, name=NAME)
         if any((folder / "unet").glob("*.safetensors")):
             break
     return folder

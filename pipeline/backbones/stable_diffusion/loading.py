@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.checkpoints import check_missing, one_line, tensor_shapes
+from pipeline.backbones.pretrained import quiet_libraries
 from pipeline.errors import BadInput
-from pipeline.stages.pretrained import quiet_libraries
+from pipeline.io.checkpoints import check_missing, one_line, tensor_shapes
 
 _ATTENTION_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 _PORTION = 1 << 26  # values read before a file is mapped anew
@@ -41,6 +41,27 @@ def empty_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: 
     except (ValueError, TypeError, KeyError, IndexError, RuntimeError, NotImplementedError) as error:
         raise BadInput(where, found=one_line(error), needed=f"a config of {cls.__name__}") from None
     return model.to_empty(device="cpu")
+
+
+def empty_unet(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
+    """An empty UNet2DConditionModel. Raises BadInput as ``empty_model``."""
+    from diffusers import UNet2DConditionModel
+
+    return empty_model(UNet2DConditionModel, config, dtype, where)
+
+
+def empty_encoder(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
+    """An empty AutoencoderKL with its encoder alone. Raises BadInput as ``empty_model``."""
+    from diffusers import AutoencoderKL
+
+    return without_decoder(empty_model(AutoencoderKL, config, dtype, where))
+
+
+def untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
+    """U-Net and autoencoder of the given configs, freshly initialised: for training."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+
+    return UNet2DConditionModel(**unet), AutoencoderKL(**vae)
 
 
 def empty_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Module, nn.Module]:

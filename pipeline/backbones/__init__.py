@@ -1,0 +1,1 @@
+"""Networks behind the extract and detect variants: their code, and how their weights are found and loaded."""

@@ -1,0 +1,1 @@
+"""Commands beside the route: ``dzop cache``, ``dzop score`` and ``dzop lint``."""

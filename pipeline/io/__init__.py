@@ -1,0 +1,1 @@
+"""Files: reading and writing them, their digests, checkpoints of models, meshes."""
