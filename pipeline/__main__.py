@@ -40,7 +40,7 @@ from pipeline.cli.cache import cache_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.checkpoints import NotFetched, offline
-from pipeline.io.files import write_whole
+from pipeline.io.files import write_atomic
 from pipeline.route import SecondLook, Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
 from pipeline.spec import build
@@ -164,7 +164,7 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     message = told.removeprefix("error: ")
     number = int(HydraConfig.get().job.num)
     if folder := os.environ.get(FAILED):  # Ray's launcher does not take it to another machine: there the row must do
-        write_whole(Path(folder) / f"{number:06d}", json.dumps([overrides, message]))
+        write_atomic(Path(folder) / f"{number:06d}", json.dumps([overrides, message]))
     try:
         plain = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException:  # a value that stands for another which is not there

@@ -71,7 +71,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def _header(path: Path) -> PIL.Image.Image:
     if path.exists() and not path.is_file():
-        raise OSError("no regular file")
+        raise OSError("not a regular file")
     return PIL.Image.open(path, formats=IMAGE_FORMATS)
 
 

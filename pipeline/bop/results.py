@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pipeline.bop.scene import rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
-from pipeline.io.files import write_whole
+from pipeline.io.files import write_atomic
 from pipeline.items.poses import PoseEstimate
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -73,7 +73,7 @@ def rows_of(
 
 def write_results(path: Path, rows: Iterable[ResultRow]) -> None:
     """Write the csv; a reader sees the whole file or none. Numbers are written so that they read back the same."""
-    write_whole(path, "\n".join([_HEADER, *map(_line, rows), ""]).encode("ascii"))
+    write_atomic(path, "\n".join([_HEADER, *map(_line, rows), ""]).encode("ascii"))
 
 
 def read_results(path: Path) -> list[ResultRow]:

@@ -11,7 +11,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from pipeline.embedded.training import UNET, VAE, Place
-from pipeline.io.files import write_whole
+from pipeline.io.files import write_atomic
 
 MOST_BYTES = 25_000_000
 SCHEDULER = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
@@ -38,7 +38,7 @@ def export(place: Place, folder: Path) -> int:
     if size > MOST_BYTES:
         raise ValueError(f"{size} bytes of weights, at most {MOST_BYTES} may ship")
     for name, content in made.items():
-        write_whole(folder / name, content)
+        write_atomic(folder / name, content)
     return size
 
 

@@ -1,4 +1,4 @@
-"""Files that are read whole, and that a reader sees whole or not at all."""
+"""Read regular files and write them atomically."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from typing import Any
 from pipeline.errors import BadInput, DzopError
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "TGA")
-"""What is opened as an image. Others are not: Pillow hands PostScript to a program that runs what the file says."""
+"""The only formats opened as images. Pillow runs PostScript files through an external interpreter, so they stay out."""
 
 
 def read_file(path: Path, needed: str) -> bytes:
-    """Bytes of a regular file. Raises BadInput for anything else: a pipe or a device would never end."""
+    """Bytes of a regular file. Raises BadInput for anything else: reading a pipe or a device may never end."""
     try:
         if path.exists() and not path.is_file():
-            raise BadInput(path, found="no regular file", needed=needed)
+            raise BadInput(path, found="not a regular file", needed=needed)
         return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
         found = "no such file" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", error)
         raise BadInput(path, found=found, needed=needed) from None
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file beside its place and move it there; the folder is made, and nothing half-written stays behind.
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a file atomically through a temporary sibling file; missing parent folders are created.
 
-    Raises DzopError where there is no room or no right to write.
+    A reader sees the old content or all of the new one. Raises DzopError when the disk is full or not writable.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -43,12 +43,12 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> DzopError:
-    """What to do where a file could not be written."""
+    """The error to raise when writing ``path`` failed: what went wrong and what to do."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DzopError(f"{path}: the disk is full; make room or write elsewhere, then run again")
     return DzopError(f"{path}: cannot be written ({error.strerror}); write elsewhere, then run again")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file whole. Raises ValueError for a NaN, which JSON does not have."""
-    write_whole(path, json.dumps(value, indent=1, allow_nan=False))
+    """Write a JSON file atomically. Raises ValueError for NaN and infinity, which JSON cannot represent."""
+    write_atomic(path, json.dumps(value, indent=1, allow_nan=False))

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.functional.camera import project, resize_affine
 from pipeline.functional.rigid import transform
-from pipeline.io.files import write_whole
+from pipeline.io.files import write_atomic
 from pipeline.items.objects import Mesh
 from pipeline.items.views import Image
 from pipeline.stages.render.raycast import render_depth
@@ -80,7 +80,7 @@ def write_overlay(path: Path, picture: UInt8[np.ndarray, "H W 3"], *, quality: i
     """Write a picture as its suffix says (.jpg, .png); a reader sees the whole file or none."""
     stream = io.BytesIO()
     PIL.Image.fromarray(picture).save(stream, PIL.Image.registered_extensions()[path.suffix], quality=quality)
-    write_whole(path, stream.getvalue())
+    write_atomic(path, stream.getvalue())
 
 
 def clip_to_front(segments_cam: Float[np.ndarray, "e 2 3"], *, near_mm: float = _NEAR_MM) -> Float[np.ndarray, "k 2 3"]:

@@ -16,7 +16,7 @@ import jinja2
 import PIL.Image
 from markupsafe import Markup, escape
 
-from pipeline.io.files import write_whole
+from pipeline.io.files import write_atomic
 from pipeline.items.scores import Scores
 from pipeline.report import figures, tables
 from pipeline.report.families import Family, base_of, families, is_oracle, scored_by
@@ -196,7 +196,7 @@ def write_report(rows: Sequence[Row], out: Path) -> Report:
         left_out=pictures.left_out,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
-    write_whole(folder / "index.html", text)
+    write_atomic(folder / "index.html", text)
     return Report(folder / "index.html", _summary(sections, failed, folder))
 
 
@@ -289,8 +289,8 @@ def _once(name: str, names: dict[str, int]) -> str:
 
 def _write_table(folder: Path, table: Table, name: str | None = None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / f"{name or table.name}.csv", table.csv())
-    write_whole(folder / f"{name or table.name}.tex", table.latex())
+    write_atomic(folder / f"{name or table.name}.csv", table.csv())
+    write_atomic(folder / f"{name or table.name}.tex", table.latex())
 
 
 def _summary(sections: Sequence[Section], failed: Sequence[Row], folder: Path) -> str:

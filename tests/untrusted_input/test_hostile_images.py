@@ -99,7 +99,7 @@ def test_a_pipe_or_a_folder_is_no_image(tmp_path: Path, reader: str):
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "folder.png").mkdir()
     for name in ("pipe.png", "folder.png"):
-        assert "no regular file" in outcome(lambda name=name: READERS[reader](tmp_path / name))
+        assert "not a regular file" in outcome(lambda name=name: READERS[reader](tmp_path / name))
 
 
 def test_a_program_is_no_image_and_is_not_run(tmp_path: Path, monkeypatch):

@@ -214,5 +214,5 @@ def test_packed_detections_of_the_usual_kind_are_read(tmp_path: Path):
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.json")
-    with pytest.raises(BadInput, match="no regular file"):
+    with pytest.raises(BadInput, match="not a regular file"):
         read_json(tmp_path / "pipe.json")
