@@ -99,7 +99,7 @@ class Outputs:
             "method": self.name,
             "dataset": self.graph.run.dataset.name,
             "config": self.config,
-            "counts": self.graph.run.tally.as_record(),
+            "counts": self.graph.run.progress.as_record(),
             "scores": judged and summary_of(judged.scored),
             "warnings": list(warnings),
             "answers": told,
@@ -122,7 +122,7 @@ class Outputs:
         for answer, errors in zip(answers, _errors(answers, judged), strict=True):
             by_image[answer.scene_id, answer.im_id].append((answer, errors))
         start, drawn = time.perf_counter(), 0
-        with self.graph.run.tally.bar(len(by_image), "overlays", "image") as advance:
+        with self.graph.run.progress.bar(len(by_image), "overlays", "image") as advance:
             for image, shown in sorted(by_image.items()):
                 path = self.overlays / f"{image[0]:06d}_{image[1]:06d}.jpg"
                 if not path.exists():
@@ -130,7 +130,7 @@ class Outputs:
                     drawn += 1
                 advance(1)
         seconds = time.perf_counter() - start
-        self.graph.run.tally.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
+        self.graph.run.progress.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
 
     def draw_gallery(self, answers: Sequence[Answer], judged: Judged, count: int) -> list[Case]:
         """Pictures of how the best and the worst answers came about; those that are there are left."""
@@ -140,7 +140,7 @@ class Outputs:
         retrace, errors = self.graph.retracer(), _errors(answers, judged)
         relative = [None if e is None else e.relative_mssd for e in errors]
         chosen = pick_cases(relative, count=count, obj_ids=[a.obj_id for a in answers])
-        with self.graph.run.tally.bar(len(chosen), "gallery", "picture") as advance:
+        with self.graph.run.progress.bar(len(chosen), "gallery", "picture") as advance:
             for index in sorted(chosen, key=lambda i: answers[i].obj_id):
                 answer = answers[index]
                 path = self.folder / "gallery" / f"{_named(answer)}.jpg"
@@ -150,7 +150,7 @@ class Outputs:
                 advance(1)
         cases = [self._case(answers[index], errors[index]) for index in chosen]
         seconds = time.perf_counter() - start
-        self.graph.run.tally.add("gallery", computed=drawn, reused=len(chosen) - drawn, time_s=seconds)
+        self.graph.run.progress.add("gallery", computed=drawn, reused=len(chosen) - drawn, time_s=seconds)
         return [case for case in cases if (self.folder / case.file).exists()]
 
     def _card(self, answer: Answer, errors: PoseErrors | None, traced: Retraced) -> Card:
@@ -210,7 +210,7 @@ class Outputs:
             folder=self.folder.relative_to(self.out).as_posix(),
             csv=self.csv,
             estimates=sum(isinstance(answer, PoseEstimate) for answer in answers),
-            counts=run.tally.as_record(),
+            counts=run.progress.as_record(),
             times_s=_median_times(answers),
             bytes_per_object=self.graph.templates.feature_bytes() / max(len(run.object_ids), 1),
             failures=tuple((stage, reason, count) for (stage, reason), count in missing.most_common()),

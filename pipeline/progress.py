@@ -1,4 +1,4 @@
-"""What a run computed and what it found: rows and seconds by step, and progress bars for what takes long."""
+"""Progress of a run: rows computed and reused per step, seconds per step, and progress bars."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ STEPS = (
 
 
 @dataclass
-class Count:
-    """Rows of one step."""
+class StepCount:
+    """Rows of one step: computed by this run, reused from the store; and the seconds spent."""
 
     computed: int = 0
     reused: int = 0
@@ -35,37 +35,41 @@ class Count:
 
 
 @dataclass
-class Tally:
-    """Counts by step. ``progress`` False silences the bars, never the table."""
+class Progress:
+    """Counts per step, and progress bars. ``show_bars=False`` hides the bars; counting goes on."""
 
-    progress: bool = True
-    counts: dict[str, Count] = field(default_factory=dict)
+    show_bars: bool = True
+    counts: dict[str, StepCount] = field(default_factory=dict)
+
+    def step(self, name: str) -> StepCount:
+        """The counts of a step so far; zeros for a new one."""
+        return self.counts.setdefault(name, StepCount())
 
     def add(self, step: str, *, computed: int = 0, reused: int = 0, time_s: float = 0.0) -> None:
-        """Count rows of a step."""
-        count = self.of(step)
+        """Add rows and seconds to a step."""
+        count = self.step(step)
         count.computed += computed
         count.reused += reused
         count.time_s += time_s
 
-    def merge(self, counts: Mapping[str, Count]) -> None:
-        """Add what another process has counted."""
+    def merge(self, counts: Mapping[str, StepCount]) -> None:
+        """Add the counts of another process."""
         for step, count in counts.items():
             self.add(step, computed=count.computed, reused=count.reused, time_s=count.time_s)
 
-    def of(self, step: str) -> Count:
-        """The counts of a step so far."""
-        return self.counts.setdefault(step, Count())
-
     @contextmanager
     def bar(self, total: int, title: str, unit: str) -> Iterator[Callable[[int], None]]:
-        """A progress bar that appears after three seconds; yields the function that moves it."""
-        hidden = None if self.progress else True  # None: hidden where stderr is no terminal
-        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=hidden, dynamic_ncols=True) as bar:
-            yield lambda rows: (bar.update(rows), None)[1]
+        """Show a progress bar after three seconds; yields the function that advances it. No bar without a title."""
+        disable = None if self.show_bars and title else True  # None: tqdm hides it where stderr is no terminal
+        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=disable, dynamic_ncols=True) as bar:
+
+            def advance(rows: int) -> None:
+                bar.update(rows)
+
+            yield advance
 
     def table(self) -> str:
-        """Step, computed, reused, seconds; steps in the order of the route."""
+        """Text table of step, computed, reused and seconds, in the order of ``STEPS``."""
         lines = [f"{'step':<20}{'computed':>10}{'reused':>10}{'seconds':>10}"]
         for step in sorted(self.counts, key=STEPS.index):
             count = self.counts[step]
@@ -73,12 +77,12 @@ class Tally:
         return "\n".join(lines)
 
     def as_record(self) -> dict[str, dict[str, float]]:
-        """JSON-able counts."""
+        """The counts as JSON-able values."""
         return {step: {**vars(count), "time_s": round(count.time_s, 3)} for step, count in self.counts.items()}
 
 
-def human(size: float) -> str:
-    """Bytes in a unit a person reads."""
+def format_bytes(size: float) -> str:
+    """A number of bytes as text with a decimal unit: ``1.5 MB``."""
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1000:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"

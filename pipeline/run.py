@@ -22,7 +22,7 @@ from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Target
 from pipeline.metrics.recall import THETAS
 from pipeline.outputs import KEY_DIGITS, Outputs, now
-from pipeline.progress import Tally, human
+from pipeline.progress import Progress, format_bytes
 from pipeline.report.rows import Row, done_row, read_rows, row_id, write_row
 from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
@@ -114,7 +114,7 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     remember_in(None if store.backend.folder is None else store.backend.folder / ".digests")
     data = dataset.open()
     targets = options.select.of(data)
-    context = Context(stages, data, targets, store, runtime, Tally(runtime.progress))
+    context = Context(stages, data, targets, store, runtime, Progress(runtime.progress))
     with runtime.workers(context, threads=options.threads) as context.workers:
         graph = Graph(context)
         if options.plan:
@@ -122,7 +122,7 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
             return
         _steps(graph, options)
     seconds = time.perf_counter() - start
-    print(f"\n{context.tally.table()}\n{'whole run':<20}{'':>20}{seconds:>10.1f}", flush=True)
+    print(f"\n{context.progress.table()}\n{'whole run':<20}{'':>20}{seconds:>10.1f}", flush=True)
 
 
 def _steps(graph: Graph, options: Options) -> None:
@@ -278,11 +278,11 @@ def plan_table(nodes: Sequence[Node]) -> str:
     for node in nodes:
         cost = f"  ({node.cost})" if node.cost else ""
         lines.append(
-            f"{node.state:<9}{human(node.nbytes):>10}  {node.ref.key[:KEY_DIGITS]}  {node.step}: {node.of}{cost}"
+            f"{node.state:<9}{format_bytes(node.nbytes):>10}  {node.ref.key[:KEY_DIGITS]}  {node.step}: {node.of}{cost}"
         )
     for state in sorted({node.state for node in nodes}):
         mine = [node for node in nodes if node.state == state]
-        lines.append(f"{len(mine)} nodes {state}, {human(sum(node.nbytes for node in mine))}")
+        lines.append(f"{len(mine)} nodes {state}, {format_bytes(sum(node.nbytes for node in mine))}")
     return "\n".join(lines)
 
 
@@ -306,7 +306,8 @@ def costs_text(nodes: Sequence[Node]) -> str:
     if unknown:
         time_ = f"{time_} and " if told else ""
         time_ += f"unknown for {', '.join(unknown)}: not measured on this machine in this store"
-    disk = f"{human(exact)} of features and fits, at most {human(packed)} of templates and crops (compressed)"
+    disk = f"{format_bytes(exact)} of features and fits"
+    disk += f", at most {format_bytes(packed)} of templates and crops (compressed)"
     disk += f", and the records of {', '.join(small)}" if small else ""
     return (
         f"disk    {disk}\npasses  {sum(node.passes for node in missing)} images through the backbone\ntime    {time_}"

@@ -147,7 +147,7 @@ def graph_of(scene: Path, cache: Path, *, extract: Any = None, **changes: Any) -
 
 
 def computed(graph: Graph) -> dict[str, int]:
-    return {step: count.computed for step, count in graph.run.tally.counts.items()}
+    return {step: count.computed for step, count in graph.run.progress.counts.items()}
 
 
 def dataset_of(scene: Path) -> Dataset:
@@ -201,7 +201,7 @@ def test_templates_of_the_route_are_those_that_are_described(painted: Path, cach
     assert described.template_features(1) == graph.templates.features(1, Cosine().layer)
     graph.estimate()
     rows = 24 * len(graph.run.object_ids)
-    assert graph.run.tally.of("template features").computed <= 2 * rows  # layer 2 for both, layer 8 for the route
+    assert graph.run.progress.step("template features").computed <= 2 * rows  # layer 2 for both, layer 8 for the route
 
 
 def test_detections_come_back_from_their_file(painted: Path, cache: Path, tmp_path: Path):

@@ -8,7 +8,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from pipeline.errors import DzopError
-from pipeline.progress import human
+from pipeline.progress import format_bytes
 from pipeline.store import LocalStoreConfig, S3StoreConfig, Store
 from pipeline.store.admin import Row, collect, entries, find, verify
 
@@ -65,7 +65,7 @@ def _ls(rows: list[Row], *, long: bool) -> None:
     print(f"{'state':<11}{'rows':>6}{'size':>10}{'age':>8}  path")
     for row in rows:
         age = "-" if row.age_h is None else f"{row.age_h:.0f} h" if row.age_h < 48 else f"{row.age_h / 24:.0f} d"
-        print(f"{row.state:<11}{row.rows:>6}{human(row.stored_bytes):>10}{age:>8}  {row.path}")
+        print(f"{row.state:<11}{row.rows:>6}{format_bytes(row.stored_bytes):>10}{age:>8}  {row.path}")
         if long:
             print(f"{'':37}made from {json.dumps(row.made_from, sort_keys=True)}")
 
@@ -77,7 +77,7 @@ def _du(rows: list[Row]) -> None:
             sums[folder][0] += 1
             sums[folder][1] += row.stored_bytes
     for folder, (count, size) in sorted(sums.items(), key=lambda item: (item[0] == "total", item[0])):
-        print(f"{human(size):>10}{count:>7} entries  {folder}")
+        print(f"{format_bytes(size):>10}{count:>7} entries  {folder}")
 
 
 def _verify(store: Store) -> None:
@@ -95,5 +95,5 @@ def _gc(store: Store, older_than_days: float | None, *, dry_run: bool) -> None:
     hours = None if older_than_days is None else older_than_days * 24
     doomed = collect(store, older_than_h=hours, dry_run=dry_run)
     for row in doomed:
-        print(f"{'would remove' if dry_run else 'removed'} {row.path} ({human(row.stored_bytes)}, {row.state})")
-    print(f"{len(doomed)} entries, {human(sum(row.stored_bytes for row in doomed))}")
+        print(f"{'would remove' if dry_run else 'removed'} {row.path} ({format_bytes(row.stored_bytes)}, {row.state})")
+    print(f"{len(doomed)} entries, {format_bytes(sum(row.stored_bytes for row in doomed))}")

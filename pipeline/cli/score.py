@@ -16,7 +16,7 @@ from pipeline.io.digests import file_digest
 from pipeline.io.files import write_json
 from pipeline.metrics.bootstrap import Interval, image_index, paired_interval
 from pipeline.metrics.recall import instance_ar
-from pipeline.progress import Tally
+from pipeline.progress import Progress
 from pipeline.report.rows import Row, write_row
 from pipeline.report.scores import scores_table, summary_of
 from pipeline.scoring import VSD_DELTA_MM, Scored, Scorer, dataset_id
@@ -158,7 +158,7 @@ def _said(given: Scoreable) -> None:
 
 
 def _scored(given: Scoreable) -> Scored:
-    with Tally().bar(len(given.scorer.images), given.path.name, "image") as advance:
+    with Progress().bar(len(given.scorer.images), given.path.name, "image") as advance:
         return given.scorer.score(given.rows, progress=advance)
 
 

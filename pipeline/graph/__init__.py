@@ -110,7 +110,7 @@ class Graph:
         kinds = [self.templates.onboarding]
         if self.detections.proposals and not self.detections.known:
             kinds.append(self.detections.proposals.describing)
-        with self.run.tally.bar(len(kinds) * len(self.run.object_ids), "onboarding", "object") as advance:
+        with self.run.progress.bar(len(kinds) * len(self.run.object_ids), "onboarding", "object") as advance:
             for work in kinds:
                 self.run.each(work, self.run.object_ids, advance)
 
@@ -122,9 +122,9 @@ class Graph:
         after: list[Work[Any]] = [self.queries.describing, self.poses.solving]
         if work in [kind.name for kind in after]:
             self.detect()
-        self.run.tally.counts.clear()
+        self.run.progress.counts.clear()
         next(kind for kind in before + after if kind.name == work).do(unit, lambda rows: None)
-        return dict(self.run.tally.counts)
+        return dict(self.run.progress.counts)
 
     def detect(self) -> list[Detection]:
         """Detections of all targets, those that cannot be used included."""

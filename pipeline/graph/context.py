@@ -18,7 +18,7 @@ from pipeline.graph.tasks import Advance, Unit, Work, Workers
 from pipeline.graph.timings import Rates, work_of
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crops, Target
-from pipeline.progress import Tally
+from pipeline.progress import Progress
 from pipeline.route import Stages
 from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
@@ -32,14 +32,14 @@ ImageId = tuple[int, int]
 
 @dataclass(eq=False)
 class Context:
-    """One run: its stages, data, store and counts. ``workers``: who does its work, None for this process alone."""
+    """One run: its stages, data, store and progress. ``workers``: who does its work, None for this process alone."""
 
     stages: Stages
     dataset: Dataset
     targets: Sequence[Target]
     store: Store
     runtime: Runtime
-    tally: Tally = field(default_factory=Tally)
+    progress: Progress = field(default_factory=Progress)
     workers: Workers | None = None
 
     @cached_property
@@ -98,7 +98,7 @@ class Context:
         for unit in units if not away else set(units).difference(away):
             work.do(unit, advance)
         for unit, counts in self.workers.each(work.name, away) if self.workers and away else ():
-            self.tally.merge(counts)
+            self.progress.merge(counts)
             if not work.done(unit):
                 found = f"that a worker has finished {work.name} of {unit}, and nothing of it in {self.store.place}"
                 raise BadInput("runtime", found=found, needed="workers that see the same files and the same store")
@@ -143,12 +143,11 @@ class Context:
         ``work``: what decides the seconds of a row, for plans; "" where nobody asks.
         """
         if all(self.store.complete(ref) for ref in refs):
-            self.tally.add(step, reused=rows)
+            self.progress.add(step, reused=rows)
             return
-        progress = Tally(self.tally.progress and bool(title))
-        with progress.bar(rows, title, "row") as advance:
+        with self.progress.bar(rows, title, "row") as advance:
             filled = self.store.fill(refs, rows=rows, batch=batch, compute=compute, document=document, progress=advance)
-        self.tally.add(step, computed=filled.computed, reused=filled.reused, time_s=filled.time_s)
+        self.progress.add(step, computed=filled.computed, reused=filled.reused, time_s=filled.time_s)
         if work and filled.computed:
             self.rates.note(work, filled.computed, filled.time_s)
 
@@ -158,7 +157,7 @@ class Context:
         """Features of the layers that are missing, in as few passes as possible: one for all of them."""
         missing = {layer: ref for layer, ref in refs.items() if not self.store.complete(ref)}
         if not missing:
-            self.tally.add(step, reused=rows)
+            self.progress.add(step, reused=rows)
             return
 
         def compute(batch: list[int]) -> dict[str, dict[str, np.ndarray]]:

@@ -58,7 +58,7 @@ class DetectionNodes:
             found = self._find()
             self.run.store.put_document(self.ref, [detection_record(d) for d in found], rows=len(found))
         found = [detection_of(record) for record in self.run.store.read(self.ref).document]
-        self.run.tally.add("detections", **{"computed" if fresh else "reused": len(found)})
+        self.run.progress.add("detections", **{"computed" if fresh else "reused": len(found)})
         return found
 
     def identity(self, detection: Detection) -> dict[str, Any]:
@@ -71,11 +71,11 @@ class DetectionNodes:
         if not isinstance(detect, DescribingDetector):
             return detect(self.run.dataset, self.run.targets)
         assert self.proposals is not None
-        with self.run.tally.bar(len(self.run.object_ids), "descriptions", "object") as advance:
+        with self.run.progress.bar(len(self.run.object_ids), "descriptions", "object") as advance:
             self.run.each(self.proposals.describing, self.run.object_ids, advance)
         templates = {obj_id: self.proposals.template_descriptors(obj_id) for obj_id in self.run.object_ids}
         found: list[Detection] = []
-        with self.run.tally.bar(len(self.run.image_ids), "proposals", "image") as advance:
+        with self.run.progress.bar(len(self.run.image_ids), "proposals", "image") as advance:
             self.run.each(self.proposals.proposing_all, self.run.image_ids, advance)
         for image in self.run.image_ids:
             targets = [t for t in self.run.targets if (t.scene_id, t.im_id) == image]

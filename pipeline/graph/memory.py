@@ -17,7 +17,7 @@ from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.templates import DRAWN_LARGER
-from pipeline.progress import human
+from pipeline.progress import format_bytes
 from pipeline.stages.match import FittedMatcher, TruthMatcher
 
 VIEWS_BYTES = 256 << 20  # of whole templates, kept for the next query of their object, where there is a budget
@@ -63,8 +63,8 @@ class Memory:
 
     def text(self) -> str:
         """The peak and its parts."""
-        told = ", ".join(f"{name} {human(size)}" for name, size in self.parts.items() if size)
-        return f"{human(self.peak)} ({told}{f'; not counted: {self.unknown}' if self.unknown else ''})"
+        told = ", ".join(f"{name} {format_bytes(size)}" for name, size in self.parts.items() if size)
+        return f"{format_bytes(self.peak)} ({told}{f'; not counted: {self.unknown}' if self.unknown else ''})"
 
     def check(self, limit: int | None, field: str, found: object) -> None:
         """Raise BadInput where the peak is above a limit, with what would help."""
@@ -72,10 +72,8 @@ class Memory:
             return
         most = max(self.parts, key=lambda name: self.parts[name])
         helps = dict.fromkeys(_HELP[name.split(" of ")[0]] for name in (self.largest, most) if name)
-        needed = (
-            f"{human(self.peak / SHARE)}: a tenth to spare beside {self.text()}; what would help: {'; '.join(helps)}"
-        )
-        raise BadInput(field, found=found, needed=needed)
+        spare = f"{format_bytes(self.peak / SHARE)}: a tenth to spare beside {self.text()}"
+        raise BadInput(field, found=found, needed=f"{spare}; what would help: {'; '.join(helps)}")
 
 
 @dataclass(frozen=True)

@@ -83,22 +83,22 @@ class PoseNodes:
         missing = [group for group in self.groups if not self.run.store.complete(self.poses(group))]
         self._make_queries(sorted({(t.scene_id, t.im_id) for group in missing for t in self.groups[group]}))
         total = sum(len(self.groups[group]) for group in missing)
-        with self.run.tally.bar(total, "poses", "target") as advance:
+        with self.run.progress.bar(total, "poses", "target") as advance:
             self.run.each(self.solving, sorted(missing, key=lambda group: group[1]), advance)
         made = [self.run.store.read(self.poses(group)).document["answers"] for group in self.groups]
         records = [record for answers in made for record in answers]
         self.run.store.put_document(ref, {"answers": records}, rows=len(records))
 
     def _make_queries(self, images: Sequence[ImageId]) -> None:
-        with self.run.tally.bar(len(images), "query features", "image") as advance:
+        with self.run.progress.bar(len(images), "query features", "image") as advance:
             self.run.each(self.queries.describing, images, advance)
 
     def _count_reused(self, answers: int) -> None:
         """Whatever this run stands on and did not compute was reused."""
         usable = sum(len(found) for found in self.queries.of_image.values())
         for step, rows in (("query crops", usable), ("query features", usable), ("poses", answers)):
-            count = self.run.tally.of(step)
-            self.run.tally.add(step, reused=max(0, rows - count.computed - count.reused))
+            count = self.run.progress.step(step)
+            self.run.progress.add(step, reused=max(0, rows - count.computed - count.reused))
 
     @cached_property
     def solving(self) -> Work[tuple[int, int]]:
@@ -116,7 +116,7 @@ class PoseNodes:
         seconds = sum(sum(a.times_s.values()) for a in answers if isinstance(a, PoseEstimate))
         document = {"answers": [record_of(answer) for answer in answers]}
         self.run.store.put_document(ref, document, rows=len(answers), time_s=seconds)
-        self.run.tally.add("poses", computed=len(answers), time_s=seconds)
+        self.run.progress.add("poses", computed=len(answers), time_s=seconds)
         templates = self.run.store.read(self.templates.templates(obj_id)).rows
         work = work_of("poses", self.run.stages, rows=templates)
         self.run.rates.note(work, len(self.groups[group]), time.perf_counter() - began)

@@ -153,7 +153,7 @@ class ProposalNodes:
             self.run.store.put_document(ref, records, rows=len(found), time_s=seconds)
         entry = self.run.store.read(ref)
         counted = {"computed" if fresh else "reused": entry.rows}
-        self.run.tally.add("proposals", **counted, time_s=entry.time_s if fresh else 0.0)
+        self.run.progress.add("proposals", **counted, time_s=entry.time_s if fresh else 0.0)
         return [proposal_of(record) for record in entry.document]
 
     def _make_crops(self, image: ImageId, proposals: Sequence[Proposal]) -> int:

@@ -105,7 +105,7 @@ class QueryNodes:
         """Crop an image's detections; those that cannot be cropped are left out, with their reason."""
         ref = self.crops(image)
         if self.run.store.complete(ref):
-            self.run.tally.add("query crops", reused=self.run.store.read(ref).rows)
+            self.run.progress.add("query crops", reused=self.run.store.read(ref).rows)
             return self.found(image)
         began = time.perf_counter()
         crops, document = self._cropped(image)

@@ -93,7 +93,7 @@ class ScoreNodes:
             self._make(answers)
         entry = self.run.store.read(self.ref)
         seconds = entry.time_s if fresh else 0.0
-        self.run.tally.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
+        self.run.progress.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
         errors = tuple(errors_of(record) for record in entry.document["errors"])
         templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
         return Judged(
@@ -105,7 +105,7 @@ class ScoreNodes:
 
     def _make(self, answers: Sequence[Answer]) -> None:
         start = time.perf_counter()
-        with self.run.tally.bar(len(self.scorer.images), "scores", "image") as advance:
+        with self.run.progress.bar(len(self.scorer.images), "scores", "image") as advance:
             scored = self.scorer.score([row for _, row in _rows(answers)], progress=advance)
         of = _by_answer(answers, scored.errors)
         angles = {
@@ -129,7 +129,7 @@ class ScoreNodes:
         """Each instance with the median error of its answer's correspondences, over the diameter."""
         assert self.retrace is not None
         found: list[list[int | float]] = []
-        with self.run.tally.bar(len(answers), "correspondences", "answer") as advance:
+        with self.run.progress.bar(len(answers), "correspondences", "answer") as advance:
             for answer, errors in sorted(zip(answers, of, strict=True), key=lambda pair: pair[0].obj_id):
                 advance(1)
                 instance, traced = _instance(answer, errors), self.retrace(answer)

@@ -14,11 +14,11 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
-from pipeline.progress import Count
+from pipeline.progress import StepCount
 
 Unit = TypeVar("Unit", bound=Hashable)
 Advance = Callable[[int], None]
-Counts = Mapping[str, Count]
+Counts = Mapping[str, StepCount]
 
 
 @dataclass(frozen=True)

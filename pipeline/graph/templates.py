@@ -93,7 +93,7 @@ class TemplateNodes:
         ref = self.templates(obj_id)
         if self.run.store.complete(ref):
             rows = self.run.store.read(ref).rows
-            self.run.tally.add("templates", reused=rows)
+            self.run.progress.add("templates", reused=rows)
             return rows
         K, T_cam_obj, (height, width) = self.run.stages.render.cameras(self.run.model(obj_id).mesh)
         count = len(T_cam_obj)
@@ -171,11 +171,11 @@ class TemplateNodes:
         for fit in self.run.stages.fits:
             ref, start = self.fitted(obj_id, fit), time.perf_counter()
             if self.run.store.complete(ref):
-                self.run.tally.add("fits", reused=1)
+                self.run.progress.add("fits", reused=1)
                 continue
             base = {} if fit.base is None else self.read_fitted(obj_id, fit.base, device="cpu")
             arrays = {name: array.numpy() for name, array in fit(cells(fit.layer), base).items()}
-            self.run.tally.add("fits", time_s=time.perf_counter() - start)
+            self.run.progress.add("fits", time_s=time.perf_counter() - start)
             self._keep(ref, arrays)
         if missing and len(missing) == len(self.run.stages.fits):
             self.run.rates.note(work_of("fits", self.run.stages), 1, time.perf_counter() - began)

@@ -14,7 +14,7 @@ from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import Interval, image_index, paired_interval
 from pipeline.metrics.recall import instance_ar, instance_recalls
 from pipeline.metrics.template_error import ACC_DEG
-from pipeline.progress import human
+from pipeline.progress import format_bytes
 from pipeline.report import published
 from pipeline.report.families import Family, difference, is_oracle, settings
 from pipeline.report.figures import ar_head, ar_interval, value_text
@@ -84,7 +84,7 @@ def _run(row: Row, base: Row) -> tuple[str, ...]:
         f"{angles.mean():.1f} deg" if len(angles) else NONE,
         f"{row.estimates}/{len(scores)}",
         f"{sum(row.times_s.values()):.2f}" if row.times_s else NONE,
-        human(row.bytes_per_object) if row.bytes_per_object else NONE,
+        format_bytes(row.bytes_per_object) if row.bytes_per_object else NONE,
     )
 
 
