@@ -3,45 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from benchmarks import reference
 from benchmarks.inputs import SD15, TEMPLATES, Scene, scene
 from benchmarks.measure import Figure, Times, interleaved
+from benchmarks.presets import PAPER
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.functional.similarity import unit
-from pipeline.route import Stages, trace_pose
-from pipeline.stages.choose.inliers import Inliers
+from pipeline.route import trace_pose
 from pipeline.stages.cluster.kmeans import KMeans
-from pipeline.stages.correspond.cosine import Cosine as Corresponder
-from pipeline.stages.crop.square import Square
-from pipeline.stages.detect.gt_mask import GtMask
-from pipeline.stages.extract.pixels import Pixels
 from pipeline.stages.fuse.pca import Pca
-from pipeline.stages.match.cosine import Cosine
-from pipeline.stages.refine.none import NoRefinement
-from pipeline.stages.render.raycast import Raycast
-from pipeline.stages.solve.epnp import Epnp
 
-FUSE, KMEANS = Pca(), KMeans()
-_CHOSEN: dict[str, Any] = {
-    "render": Raycast(),
-    "extract": Pixels(),
-    "crop": Square(),
-    "match": Cosine(),
-    "fuse": FUSE,
-    "cluster": KMEANS,
-    "correspond": Corresponder(),
-    "solve": Epnp(),
-    "choose": Inliers(),
-    "refine": NoRefinement(),
-    "detect": GtMask(),
-}
-PAPER = Stages(**_CHOSEN)
-"""The stages of method=dzop_sd from match to refine; the others are not asked here."""
+FUSE, KMEANS = Pca(), KMeans()  # those of PAPER, with their types
 
 
 def online(*, device: str, repeats: int) -> list[Figure]:

@@ -12,6 +12,7 @@ import torch
 from command import run_dzop
 from make_sam import write_sam
 from PIL import Image as Picture
+from presets import QUICK
 
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.detections import write_detections
@@ -23,22 +24,13 @@ from pipeline.io.meshes import read_mesh, write_ply
 from pipeline.items.features import CLASS_TOKEN_LAYER, FeatureMaps
 from pipeline.items.poses import NoEstimate
 from pipeline.items.views import Crops, Image, Proposal
-from pipeline.route import Stages
 from pipeline.spec import Runtime, Spec, spec
-from pipeline.stages.choose.inliers import Inliers
-from pipeline.stages.cluster.one import One
-from pipeline.stages.correspond.cosine import Cosine as Corresponder
-from pipeline.stages.crop.square import Square
 from pipeline.stages.detect.cnos import Cnos
 from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.detect.json import Json
 from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.extract.hog import Hog
-from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.match.cosine import Cosine
-from pipeline.stages.refine.none import NoRefinement
-from pipeline.stages.render.raycast import Raycast
-from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
 
@@ -129,19 +121,8 @@ def calls() -> list[str]:
 
 def graph_of(scene: Path, cache: Path, *, extract: Any = None, **changes: Any) -> Graph:
     fields: dict[str, Any] = {"describe": Hue(), "proposals": TrueMasks(root=str(scene))}
-    stages = Stages(
-        render=Raycast(count=24, size=128),
-        extract=extract or Hog(),
-        crop=Square(),
-        match=Cosine(),
-        fuse=Concat(layers=(8,)),
-        cluster=One(),
-        correspond=Corresponder(),
-        solve=Epnp(),
-        choose=Inliers(),
-        refine=NoRefinement(),
-        detect=changes.pop("detect", None) or Cnos(**{**fields, **changes}),
-    )
+    detect = changes.pop("detect", None) or Cnos(**{**fields, **changes})
+    stages = replace(QUICK, extract=extract or QUICK.extract, detect=detect)
     data, store = open_dataset(scene, name="toy"), Store(LocalStoreConfig(root=str(cache)))
     return Graph(Context(stages, data, data.targets, store, Runtime(progress=False, device="cpu")))
 

@@ -1,31 +1,29 @@
 """With object coordinates as features every pose error is a geometry error: conventions, lifting, PnP."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from benchmarks.presets import PAPER
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
 from pipeline.graph import Context, Graph
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Crops, Geometry
-from pipeline.route import Query, Stages, TemplateView, trace_pose
+from pipeline.route import Query, TemplateView, trace_pose
 from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
-from pipeline.stages.choose.inliers import Inliers
-from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
 from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.correspond.cyclic import Cyclic
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
-from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.fuse.concat import Concat
-from pipeline.stages.fuse.pca import Pca
 from pipeline.stages.fuse.template_pca import TemplatePca
-from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.words import Words
 from pipeline.stages.refine.none import NoRefinement
 from pipeline.stages.render.raycast import Raycast
@@ -34,19 +32,7 @@ from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.objects import make_object
 from pipeline.synthetic.scenes import write_dataset
 
-FULL = Stages(
-    render=Raycast(count=80),
-    extract=Coordinates(),
-    crop=Square(),
-    match=Cosine(),
-    fuse=Pca(),
-    cluster=KMeans(),
-    correspond=Corresponder(),
-    solve=Epnp(),
-    choose=Inliers(),
-    refine=NoRefinement(),
-    detect=GtMask(),
-)
+FULL = replace(PAPER, render=Raycast(count=80), extract=Coordinates())
 ABLATIONS = {
     "whole route": {},
     "clusters off": {"cluster": One()},
@@ -77,7 +63,7 @@ def store(cache) -> Store:
 
 
 def errors(scenes: Dataset, store: Store, **changes: object) -> list[PoseErrors]:
-    stages = Stages(**{**vars(FULL), **changes})
+    stages = replace(FULL, **changes)
     graph = Graph(Context(stages, scenes, scenes.targets, store, Runtime(progress=False)))
     answers = graph.estimate()
     judged = graph.scores(Scorer(scenes, scenes.targets, "models", with_vsd=False)).judge(answers)
@@ -137,7 +123,7 @@ def test_a_query_magnified_by_three_against_its_own_template_comes_back_within_a
 ):
     query, template = magnified_query(3, crop)
     changes = {"crop": crop, "correspond": Corresponder(kernel=subpixel), "solve": Epnp(plane=plane)}
-    stages = Stages(**{**vars(FULL), **changes})
+    stages = replace(FULL, **changes)
     best = trace_pose(stages, query, OneTemplate(template)).best
     assert best.solution is not None
     points = best.points_obj[np.isfinite(best.points_obj).all(1)]
@@ -158,8 +144,7 @@ class Shifted(NoRefinement):
 def test_the_refined_pose_is_answered_with_the_solvers_inliers_and_its_own_reprojection():
     query, template = magnified_query(2)
     plain, shifted = (
-        trace_pose(Stages(**{**vars(FULL), "refine": refine}), query, OneTemplate(template))
-        for refine in (NoRefinement(), Shifted())
+        trace_pose(replace(FULL, refine=refine), query, OneTemplate(template)) for refine in (NoRefinement(), Shifted())
     )
     before, after = plain.best.solution, shifted.best.solution
     assert before is not None

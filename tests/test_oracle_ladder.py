@@ -1,10 +1,12 @@
 """The oracle ladder's rungs see the truth, nothing else does, and what they see is part of their keys."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from presets import QUICK
 
 from pipeline.bop.dataset import open_dataset
 from pipeline.errors import BadInput
@@ -12,38 +14,15 @@ from pipeline.functional.rigid import rotation_angle_deg, rotation_between
 from pipeline.graph import Context, Graph
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import answer_of, record_of
-from pipeline.route import Stages
 from pipeline.spec import Runtime
-from pipeline.stages.choose.inliers import Inliers
-from pipeline.stages.cluster.one import One
-from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.correspond.oracle import Oracle as CorrespondOracle
-from pipeline.stages.crop.square import Square
-from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.extract.coordinates import Coordinates
-from pipeline.stages.extract.hog import Hog
-from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.oracle import Oracle
-from pipeline.stages.refine.none import NoRefinement
-from pipeline.stages.render.raycast import Raycast
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
 
-PLAIN = Stages(
-    render=Raycast(count=24, size=128),
-    extract=Hog(),
-    crop=Square(),
-    match=Cosine(),
-    fuse=Concat(layers=(8,)),
-    cluster=One(),
-    correspond=Corresponder(),
-    solve=Epnp(),
-    choose=Inliers(),
-    refine=NoRefinement(),
-    detect=GtMask(),
-)
 ORACLES = {"match": {"match": Oracle()}, "correspond": {"correspond": CorrespondOracle()}}
 
 
@@ -56,7 +35,7 @@ def scene(tmp_path) -> Path:
 
 def graph_of(scene: Path, **changes: object) -> Graph:
     data, store = open_dataset(scene, name="toy"), Store(LocalStoreConfig(root=str(scene.parent / "cache")))
-    stages = Stages(**{**vars(PLAIN), **changes})
+    stages = replace(QUICK, **changes)
     return Graph(Context(stages, data, data.targets, store, Runtime(progress=False, device="cpu")))
 
 

@@ -6,7 +6,8 @@ import torch
 
 from benchmarks import reference
 from benchmarks.inputs import TOY, scene
-from benchmarks.online import PAPER, Plain
+from benchmarks.online import Plain
+from benchmarks.presets import PAPER
 from pipeline.functional import camera, rigid
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import cell_mask, foreground

@@ -1,13 +1,14 @@
 """The route's geometry: poses in the plane of a crop, and from a template alone."""
 
-from dataclasses import fields
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from benchmarks.presets import PAPER
 from pipeline.functional import camera, rigid
-from pipeline.route import Query, Stages, TemplateView, _solved, template_pose
+from pipeline.route import Query, TemplateView, _solved, template_pose
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.stages.solve.poselib import Poselib
 
@@ -26,9 +27,7 @@ def solved(solve: Epnp | Poselib, A_crop_img: np.ndarray, *, noise_px: float = 0
     px = camera.project(K, rigid.transform(T, points)) + noise_px * np.random.default_rng(1).normal(size=(80, 2))
     seen = np.ones(80, bool)
     seen[::9] = False
-    others = dict.fromkeys(field.name for field in fields(Stages) if field.name not in ("solve", "fallback"))
-    stages = Stages(**others, solve=solve)
-    return _solved(stages, Query({}, MASK, A_crop_img, K), points, px, seen), seen, points, px
+    return _solved(replace(PAPER, solve=solve), Query({}, MASK, A_crop_img, K), points, px, seen), seen, points, px
 
 
 @pytest.mark.parametrize("crop", CROPS)

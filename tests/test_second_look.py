@@ -5,23 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from presets import QUICK
 
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
 from pipeline.functional.masks import foreground
 from pipeline.graph import Context, Graph
 from pipeline.items.poses import PoseEstimate
-from pipeline.route import Stages, trace_pose
+from pipeline.route import trace_pose
 from pipeline.spec import Runtime
 from pipeline.stages.choose.agreement import Agreement
 from pipeline.stages.cluster.kmeans import KMeans
-from pipeline.stages.cluster.one import One
-from pipeline.stages.correspond.cosine import Cosine as Corresponder
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
-from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.extract.embedded import Embedded
-from pipeline.stages.extract.hog import Hog
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.learned import Learned
 from pipeline.stages.lift import lift
@@ -29,22 +26,16 @@ from pipeline.stages.match.masked_cosine import MaskedCosine
 from pipeline.stages.refine.featuremetric import Featuremetric
 from pipeline.stages.render.pyrender import Pyrender
 from pipeline.stages.render.raycast import Raycast
-from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
 
-STAGES = Stages(
+STAGES = replace(
+    QUICK,
     render=Raycast(viewpoints="superfibonacci", count=100),
-    extract=Hog(),
-    crop=Square(),
     match=MaskedCosine(top_k=3),
     fuse=Concat(layers=(8, 11)),
-    cluster=One(),
-    correspond=Corresponder(),
-    solve=Epnp(),
     choose=Agreement(),
     refine=Featuremetric(),
-    detect=GtMask(),
     second_look=2,
 )
 
@@ -57,7 +48,7 @@ def scenes(tmp_path_factory) -> Dataset:
 
 
 def graph(scenes: Dataset, cache, **changes: object) -> Graph:
-    stages = Stages(**{**vars(STAGES), **changes})
+    stages = replace(STAGES, **changes)
     store = Store(LocalStoreConfig(root=str(cache)))
     return Graph(Context(stages, scenes, scenes.targets, store, Runtime(progress=False, device="cpu")))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.online import PAPER
+from benchmarks.presets import PAPER
 from pipeline.bop.dataset import open_dataset
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph
