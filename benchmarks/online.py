@@ -12,7 +12,7 @@ from benchmarks.measure import Figure, Times, interleaved
 from benchmarks.presets import PAPER
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import cell_mask, foreground
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 from pipeline.route import trace_pose
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.fuse.pca import Pca
@@ -48,7 +48,7 @@ def steps(made: Scene) -> dict[str, dict[str, Callable[[], object]]]:
     pair = PAPER.fuse(query.features, template.features, query.mask, template.mask)
     clusters = PAPER.cluster(pair)
     matches = PAPER.correspond(pair, clusters, crop_size=PAPER.crop.size)
-    cells = unit(pair.query.float().flatten(1).T[foreground(pair.query_mask)]).contiguous()
+    cells = l2_normalize(pair.query.float().flatten(1).T[foreground(pair.query_mask)]).contiguous()
     points, px = _points(made)
     plain = Plain(made)
     labels = clusters.query_label.cpu().numpy(), clusters.template_label.cpu().numpy(), clusters.pairs.cpu().numpy()

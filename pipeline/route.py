@@ -359,7 +359,7 @@ def _matched(
         return stages.correspond(pair, clusters, crop_size=stages.crop.size)
     template_px, points_obj = _template_cells(stages, template, pair)
     true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
-    true_px = torch.from_numpy(camera.apply(query.A_crop_img, true_px_img)).to(template_px.device)
+    true_px = torch.from_numpy(camera.apply_homography(query.A_crop_img, true_px_img)).to(template_px.device)
     return stages.correspond.by_truth(template_px, true_px, query.mask)
 
 
@@ -410,7 +410,7 @@ def _lifted(
     template_px = matches.template_px.double().cpu().numpy()
     query_px = matches.query_px.double().cpu().numpy()
     points_obj = lift(template_px, template.A_crop_img, template.depth_mm, template.K, template.T_cam_obj)
-    return points_obj, camera.apply(np.linalg.inv(query.A_crop_img), query_px)
+    return points_obj, camera.apply_homography(np.linalg.inv(query.A_crop_img), query_px)
 
 
 def _solved(
@@ -427,7 +427,7 @@ def _solved(
         inliers[seen] = solution.inliers
         return PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
     K_crop, R_crop_cam = camera.crop_camera(query.A_crop_img, query.K)
-    solution = stages.solve(points, camera.apply(query.A_crop_img, px_img), K_crop)
+    solution = stages.solve(points, camera.apply_homography(query.A_crop_img, px_img), K_crop)
     inliers[seen] = solution.inliers
     T_cam_obj = rigid.rigid(R_crop_cam.T, np.zeros(3)) @ solution.T_cam_obj
     error_px = reprojection_error_px(points_obj[inliers], query_px_img[inliers], query.K, T_cam_obj)

@@ -11,7 +11,7 @@ from benchmarks.presets import PAPER
 from pipeline.functional import camera, rigid
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import cell_mask, foreground
-from pipeline.functional.similarity import global_cosine, unit
+from pipeline.functional.similarity import global_cosine, l2_normalize
 from pipeline.route import trace_pose
 
 
@@ -55,7 +55,7 @@ def test_fused_maps_have_the_references_inner_products(pair, plain):
 
 
 def test_k_means_ends_at_the_references_centres(pair):
-    points = unit(pair.query.flatten(1).T[foreground(pair.query_mask)]).contiguous()
+    points = l2_normalize(pair.query.flatten(1).T[foreground(pair.query_mask)]).contiguous()
     label, centre = kmeans(points, count=40, seed=3, iterations=30)
     their_label, their_centre = reference.k_means(points.double().numpy(), count=40, seed=3, iterations=30)
     # a point in between two centres may go to either in float32, which moves centres by little

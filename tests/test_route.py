@@ -70,7 +70,7 @@ def test_a_template_in_a_square_crop_keeps_its_place_and_its_size():
     A_template = camera.square_crop((250.0, 200.0, 370.0, 300.0), size=128, padding_ratio=1.2)
     found = template_pose(Query({}, MASK, CROPS["square"], K), view(A_template, T_template))
     at = [
-        camera.apply(A, camera.project(K, pose[:3, 3]))
+        camera.apply_homography(A, camera.project(K, pose[:3, 3]))
         for A, pose in ((A_template, T_template), (CROPS["square"], found))
     ]
     np.testing.assert_allclose(*at, atol=1e-9)

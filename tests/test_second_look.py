@@ -82,7 +82,7 @@ def test_a_drawn_view_shows_the_object_where_the_querys_crop_would(scenes, cache
     points = lift(crop_px, drawn.A_crop_img, drawn.depth_mm, drawn.K, drawn.T_cam_obj)
     seen = np.isfinite(points).all(1)
     assert seen.mean() > 0.8  # the rest lies across the outline, where depth is of two surfaces
-    shown = camera.apply(A, camera.project(K, rigid.transform(gt.T_cam_obj, points[seen])))
+    shown = camera.apply_homography(A, camera.project(K, rigid.transform(gt.T_cam_obj, points[seen])))
     np.testing.assert_allclose(shown, crop_px[seen], atol=1e-6)
 
 

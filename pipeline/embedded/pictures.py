@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.embedded.views import NOTHING, SIZE
 from pipeline.functional.camera import mask_bbox, square_crop
-from pipeline.functional.shading import lit
+from pipeline.functional.shading import shade
 from pipeline.synthetic.parts import Rng
 
 AMBIENT, DIFFUSE = 0.45, 0.55  # of templates: conf/render
@@ -46,7 +46,7 @@ class Picture:
 def template(view: View, rng: Rng) -> Picture:
     """As render and crop draw it: one headlight, black ground; a little softer on some, as supersampled ones are."""
     rays = _rays(view)
-    colour = lit(view.albedo.astype(np.float32), view.normal, rays, ambient=AMBIENT, diffuse=DIFFUSE)
+    colour = shade(view.albedo.astype(np.float32), view.normal, rays, ambient=AMBIENT, diffuse=DIFFUSE)
     if rng.uniform() < 0.5:
         colour = cv2.GaussianBlur(colour, (0, 0), rng.uniform(0.3, 0.6))
     rgb = np.rint(np.clip(colour * view.mask[..., None], 0, 255)).astype(np.uint8)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.functional.viewpoints import unit_sphere
+from pipeline.functional.viewpoints import icosphere_mesh
 from pipeline.items.objects import Mesh
 from pipeline.synthetic.parts import Rng, Shape, noise, random_direction, random_rotation, superquadric, tube, turned
 
@@ -45,7 +45,7 @@ def _assembly(rng: Rng) -> list[Shape]:
 
 def _blob(rng: Rng) -> list[Shape]:
     """A sphere displaced by smooth noise."""
-    points, faces = unit_sphere(3)
+    points, faces = icosphere_mesh(3)
     radius = 1 + rng.uniform(0.1, 0.4) * noise(points, rng, scale=rng.uniform(0.6, 1.1))
     radius = radius + rng.uniform(0, 0.12) * noise(points, rng, scale=0.3)
     return [(points * np.maximum(radius, 0.3)[:, None] * rng.uniform(0.45, 1.1, 3), faces)]

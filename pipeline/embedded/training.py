@@ -25,7 +25,7 @@ from pipeline.backbones.stable_diffusion.loading import untrained
 from pipeline.embedded import losses
 from pipeline.embedded.batches import CELLS, PairBatch, Source, pair_batch, picture_batch
 from pipeline.functional.aggregation import Aggregation
-from pipeline.functional.gradients import edge_histograms, with_edges
+from pipeline.functional.gradients import append_edges, edge_histograms
 from pipeline.stages.extract.embedded import PROMPT
 
 LAYERS, MATCH_LAYER, DIM, TIMESTEP = (2, 5, 8, 11), 8, 64, 50
@@ -228,7 +228,7 @@ def described_losses(model: Described, latent: Tensor, batch: PairBatch) -> dict
     """Correspondence and retrieval losses of a batch."""
     descriptors, coarse = model(latent)
     scale = model.log_scale.clamp(max=math.log(60.0)).exp()
-    whole = with_edges(descriptors, edge_histograms(batch.rgb, batch.mask, cells=CELLS), weight=_EDGES)
+    whole = append_edges(descriptors, edge_histograms(batch.rgb, batch.mask, cells=CELLS), weight=_EDGES)
     scores = losses.retrieval_scores(coarse, batch)
     return {
         "correspondence": losses.correspondence_loss(descriptors, batch, scale[0]),

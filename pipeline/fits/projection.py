@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.errors import DzopError
 from pipeline.fits import Fit, Fitted
-from pipeline.functional.pca import principal_axes_in_blocks, projected
+from pipeline.functional.pca import principal_axes_in_blocks, project_onto_axes
 from pipeline.items.features import TemplateCells
 from pipeline.spec import NonNegative, Positive, Spec, spec
 
@@ -46,5 +46,5 @@ class Projection(Spec):
 
 def on_axes(maps: Float[Tensor, "c h w"], fitted: Fitted) -> Float[Tensor, "k h w"]:
     """A map projected onto a Projection's axes."""
-    cells = projected(maps.flatten(1).T, fitted["mean"], fitted["axes"])
+    cells = project_onto_axes(maps.flatten(1).T, fitted["mean"], fitted["axes"])
     return cells.T.unflatten(1, maps.shape[1:])

@@ -12,8 +12,8 @@ from torch import Tensor
 from pipeline.fits import Fit, Fitted
 from pipeline.fits.projection import Projection
 from pipeline.functional.kmeans import kmeans
-from pipeline.functional.pca import projected
-from pipeline.functional.similarity import unit
+from pipeline.functional.pca import project_onto_axes
+from pipeline.functional.similarity import l2_normalize
 from pipeline.functional.tfidf import inverse_frequency, nearest_words, soft_weights, word_counts
 from pipeline.items.features import TemplateCells
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
@@ -56,7 +56,7 @@ class Vocabulary(Spec):
 
     def __call__(self, cells: TemplateCells, base: Fitted) -> dict[str, Tensor]:
         """``words`` (w d), ``idf`` (w) and unit vectors ``templates`` (n w); w is at most ``count``."""
-        points = projected(cells.features.cpu(), base["mean"], base["axes"])
+        points = project_onto_axes(cells.features.cpu(), base["mean"], base["axes"])
         document = cells.template.cpu()
         _, words = kmeans(self._drawn(points), count=self.count, seed=self.seed, iterations=self.iterations)
         squared, index = nearest_words(points, words, count=self.assignments)
@@ -78,7 +78,7 @@ class Vocabulary(Spec):
         idf: Float[Tensor, " w"],
     ) -> Float[Tensor, "n w"]:
         weight = soft_weights(squared, sigma_squared=self.sigma_squared if self.weights == "gaussian" else None)
-        return unit(word_counts(index, weight, document, documents=documents, words=len(idf)) * idf)
+        return l2_normalize(word_counts(index, weight, document, documents=documents, words=len(idf)) * idf)
 
     def _drawn(self, points: Float[Tensor, "m d"]) -> Float[Tensor, "s d"]:
         if len(points) <= self.samples:

@@ -10,7 +10,7 @@ from torch.nn.functional import max_pool2d
 
 from pipeline.functional.masks import foreground
 from pipeline.functional.rigid import transform
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 
 
 def agreement(
@@ -39,8 +39,8 @@ def agreement(
         return 0.0, 0.0
     reached = torch.zeros_like(query_mask)
     reached[row, column] = True
-    seen = unit(query[:, row[landed], column[landed]].float().T)
-    cosine = (seen * unit(template.flatten(1)[:, cell[landed]].float().T)).sum(1)
+    seen = l2_normalize(query[:, row[landed], column[landed]].float().T)
+    cosine = (seen * l2_normalize(template.flatten(1)[:, cell[landed]].float().T)).sum(1)
     return float(cosine.mean()), float((_closed(reached) & query_mask).sum() / query_mask.sum())
 
 

@@ -13,7 +13,7 @@ def bin_count(hierarchy: int) -> int:
     return 1 + 8 * hierarchy
 
 
-def log_binned(maps: Float[Tensor, "n c h w"], *, hierarchy: int) -> Float[Tensor, "n d h w"]:
+def log_bin(maps: Float[Tensor, "n c h w"], *, hierarchy: int) -> Float[Tensor, "n d h w"]:
     """Each cell beside its spatial bins, d = (1 + 8 ``hierarchy``) c (Amir et al., ECCVW 2022, Sec. 3, and their code).
 
     Level k holds the means of 3^k x 3^k cells, centred 3^k cells away in the 8 directions; the cell itself comes at

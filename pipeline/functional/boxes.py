@@ -18,7 +18,7 @@ def iou(box: Float[np.ndarray, " 4"], boxes: Float[np.ndarray, "n 4"]) -> Float[
     return np.divide(shared, union, out=np.zeros(len(boxes)), where=union > 0)
 
 
-def not_suppressed(
+def non_maximum_suppression(
     boxes: Float[np.ndarray, "n 4"], score: Float[np.ndarray, " n"], *, max_iou: float
 ) -> Bool[np.ndarray, " n"]:
     """Greedy non-maximum suppression: the boxes that overlap no better one that stays by more than ``max_iou``.

@@ -28,7 +28,7 @@ def unproject(
     return rays * depth_mm[..., None]
 
 
-def apply(A: Float[np.ndarray, "3 3"], px: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
+def apply_homography(A: Float[np.ndarray, "3 3"], px: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
     """Pixels moved by a homography between planes, e.g. A_crop_img; exactly affine where A's last row is (0, 0, 1)."""
     return (px @ A[:2, :2].T + A[:2, 2]) / (px @ A[2:, :2].T + A[2:, 2])
 

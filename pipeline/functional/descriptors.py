@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.functional.masks import cell_mask
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 
 
-def pooled(maps: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n S S"]) -> Float[Tensor, "n c"]:
+def pool_foreground(maps: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n S S"]) -> Float[Tensor, "n c"]:
     """Mean feature of each crop's foreground cells; of a map of one cell, as a class token is, that cell.
 
     Zeros for a crop without a pixel of mask.
@@ -20,10 +20,10 @@ def pooled(maps: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n S S"]) -> Float
     return total / inside.sum((1, 2)).clamp(min=1)[:, None]
 
 
-def mean_of_best(query: Float[Tensor, "p c"], templates: Float[Tensor, "n c"], *, best: int) -> Float[Tensor, " p"]:
+def mean_top_cosine(query: Float[Tensor, "p c"], templates: Float[Tensor, "n c"], *, best: int) -> Float[Tensor, " p"]:
     """Mean of each query's ``best`` highest cosines with the templates, of all where there are fewer.
 
     Negative cosines count as 0. Nguyen et al., ICCVW 2023, "CNOS", section 3.3, with ``best`` 5.
     """
-    cosine = (unit(query) @ unit(templates).T).clamp(0, 1)
+    cosine = (l2_normalize(query) @ l2_normalize(templates).T).clamp(0, 1)
     return cosine.topk(min(best, len(templates)), dim=1).values.mean(1)

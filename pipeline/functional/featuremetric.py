@@ -26,7 +26,7 @@ _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row, column
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class FeatureField:
     """A query's descriptors by squares of four neighbouring cells' centres, in reading order of the upper left one.
 
     ``gram``: inner products of the four. ``directions``: a descriptor read counts as if it were of unit length.
@@ -40,7 +40,7 @@ class Field:
     @classmethod
     def of(
         cls, values: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, directions: bool = False
-    ) -> Field:
+    ) -> FeatureField:
         """The field of a map."""
         h, w, c = values.shape
         four = [values[i : h - 1 + i, j : w - 1 + j] for i, j in _CORNERS]
@@ -67,7 +67,7 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False)
-class Robust:
+class RobustLoss:
     """The loss of Barron, CVPR 2019, Eq. 9, of a squared residual over ``scale`` squared; ``alpha`` below 2.
 
     0: Cauchy; -2: Geman-McClure. Smaller: sooner indifferent to how far off an outlier is.
@@ -89,7 +89,7 @@ class Robust:
         return (x / bend + 1) ** (self.alpha / 2 - 1) / self.scale**2
 
 
-def smoothed(
+def smooth_foreground(
     features: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, sigma_cells: float
 ) -> Float32[np.ndarray, "h w c"]:
     """Gaussian mean over the foreground alone, at foreground cells and behind their edge; 0 far from any.
@@ -110,7 +110,9 @@ def _gaussian(n: int, sigma: float) -> Float32[np.ndarray, "n n"]:
     return np.exp(-0.5 * (apart / sigma) ** 2).astype(np.float32)
 
 
-def read(field: Field, xy: Float[np.ndarray, "m 2"], descriptors: Float32[np.ndarray, "m c"]) -> Residuals:
+def residuals_at(
+    field: FeatureField, xy: Float[np.ndarray, "m 2"], descriptors: Float32[np.ndarray, "m c"]
+) -> Residuals:
     """What is read at positions inside the map, minus the descriptors that ought to be there. Per cell."""
     h, w = field.mask.shape
     corner = np.clip(np.floor(xy).astype(np.int64), 0, (w - 2, h - 2))
@@ -159,7 +161,7 @@ def project_cells(
     return xy, np.concatenate([by_point, np.cross(arm, by_point)], axis=2)  # row . (omega x arm) = omega . (arm x row)
 
 
-def moved(
+def apply_increment(
     T_cam_obj: Float[np.ndarray, "4 4"], centre_cam: Float[np.ndarray, " 3"], xi: Float[np.ndarray, " 6"]
 ) -> Float[np.ndarray, "4 4"]:
     """The pose after an increment about a point of the camera frame."""
@@ -169,17 +171,17 @@ def moved(
 
 
 def squared_residuals(
-    surface: Surface, field: Field, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
+    surface: Surface, field: FeatureField, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
     """Squared residual of every point, and which points read the query: the others have their ``unseen``."""
     xy, _ = project_cells(K_cell, transform(T_cam_obj, surface.points_obj), np.zeros(3))
-    seen = lands(field, xy)
+    seen = in_foreground(field, xy)
     squared = surface.unseen.copy()
-    squared[seen] = read(field, xy[seen], surface.descriptors[seen]).squared
+    squared[seen] = residuals_at(field, xy[seen], surface.descriptors[seen]).squared
     return squared, seen
 
 
-def lands(field: Field, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
+def in_foreground(field: FeatureField, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
     """Which positions lie in a foreground cell, between centres of cells."""
     h, w = field.mask.shape
     with np.errstate(invalid="ignore"):
@@ -190,10 +192,10 @@ def lands(field: Field, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
 
 def normal_equations(
     surface: Surface,
-    field: Field,
+    field: FeatureField,
     K_cell: Float[np.ndarray, "3 3"],
     T_cam_obj: Float[np.ndarray, "4 4"],
-    robust: Robust,
+    robust: RobustLoss,
 ) -> tuple[float, Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"], Float[np.ndarray, " 3"]]:
     """Mean robust cost over all points, Gauss-Newton's matrix and gradient of it, and the increment's centre.
 
@@ -203,8 +205,8 @@ def normal_equations(
     points_cam = transform(T_cam_obj, surface.points_obj)
     centre = points_cam.mean(0)
     xy, by_xi = project_cells(K_cell, points_cam, centre)
-    seen = lands(field, xy)
-    found = read(field, xy[seen], surface.descriptors[seen])
+    seen = in_foreground(field, xy)
+    found = residuals_at(field, xy[seen], surface.descriptors[seen])
     squared = surface.unseen.copy()
     squared[seen] = found.squared
     weight = robust.weight(found.squared) / len(squared)
@@ -217,10 +219,10 @@ def normal_equations(
 
 def descend(
     surface: Surface,
-    field: Field,
+    field: FeatureField,
     K_cell: Float[np.ndarray, "3 3"],
     T_cam_obj: Float[np.ndarray, "4 4"],
-    robust: Robust,
+    robust: RobustLoss,
     *,
     iterations: int,
 ) -> Float[np.ndarray, "4 4"]:
@@ -238,7 +240,7 @@ def descend(
         step = np.linalg.solve(H + damping * np.diag(diagonal), -g)
         if -(g + H @ step / 2) @ step < _FALL * cost:
             break
-        T_next = moved(T_cam_obj, centre, step)
+        T_next = apply_increment(T_cam_obj, centre, step)
         after = normal_equations(surface, field, K_cell, T_next, robust)
         if after[0] < cost:
             T_cam_obj, (cost, H, g, centre), damping = T_next, after, max(damping / 10, least)
@@ -248,7 +250,7 @@ def descend(
 
 
 def robust_scale(
-    surface: Surface, field: Field, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
+    surface: Surface, field: FeatureField, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
 ) -> float:
     """Median length of the residuals of the points that read the query; never below rounding of an exact fit."""
     squared, seen = squared_residuals(surface, field, K_cell, T_cam_obj)
@@ -257,13 +259,13 @@ def robust_scale(
     return max(median, _FLOOR * length, float(np.finfo(np.float32).tiny))
 
 
-def unit(features: Float32[np.ndarray, "*n c"]) -> Float32[np.ndarray, "*n c"]:
+def l2_normalize(features: Float32[np.ndarray, "*n c"]) -> Float32[np.ndarray, "*n c"]:
     """Descriptors of unit length; 0 stays 0."""
     length = np.linalg.norm(features, axis=-1, keepdims=True)
     return features / np.where(length > 0, length, 1)
 
 
-def level(
+def build_level(
     query: Float32[np.ndarray, "h w c"],
     query_mask: Bool[np.ndarray, "h w"],
     template: Float32[np.ndarray, "h w c"],
@@ -273,13 +275,13 @@ def level(
     *,
     sigma_cells: float,
     directions: bool,
-) -> tuple[Surface, Field]:
+) -> tuple[Surface, FeatureField]:
     """Template cells (flat indices) with their points, and the query, both smoothed alike."""
-    shown = smoothed(query, query_mask, sigma_cells=sigma_cells)
-    d = smoothed(template, template_mask, sigma_cells=sigma_cells).reshape(-1, template.shape[-1])[cell]
+    shown = smooth_foreground(query, query_mask, sigma_cells=sigma_cells)
+    d = smooth_foreground(template, template_mask, sigma_cells=sigma_cells).reshape(-1, template.shape[-1])[cell]
     if directions:
-        shown, d = unit(shown), unit(d)
+        shown, d = l2_normalize(shown), l2_normalize(d)
     inside = shown[query_mask]
     unseen = np.square(d).sum(1) + np.square(inside).sum(1).mean() - 2 * d @ inside.mean(0)
     surface = Surface(points_obj, d, np.maximum(unseen, 0).astype(np.float64))
-    return surface, Field.of(shown, query_mask, directions=directions)
+    return surface, FeatureField.of(shown, query_mask, directions=directions)

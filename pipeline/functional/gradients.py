@@ -18,17 +18,17 @@ def edge_histograms(
 ) -> Float[Tensor, "n 8 h w"]:
     """Histograms of signed gradients, the mask's border among them, in overlapping windows of two cells a side."""
     energy = oriented_energy(rgb, mask, orientations=ORIENTATIONS, signed=True, silhouette=1.0)
-    return smoothed(cell_means(energy, cells=cells))
+    return smooth_histograms(cell_means(energy, cells=cells))
 
 
-def with_edges(
+def append_edges(
     descriptors: Float[Tensor, "n d h w"], histograms: Float[Tensor, "n 8 h w"], *, weight: float
 ) -> Float[Tensor, "n d+72 h w"]:
     """Descriptors at length 1, beside the histograms of each cell and its neighbours at length ``weight`` or less.
 
     Cosines of the whole are means of both cosines, weighted by 1 and ``weight`` squared.
     """
-    edges = with_context(histograms, distance=1, contrast=CONTRAST)
+    edges = append_neighbours(histograms, distance=1, contrast=CONTRAST)
     return torch.cat([normalize(descriptors.float(), dim=1), weight * edges], dim=1)
 
 
@@ -68,7 +68,7 @@ def cell_means(energy: Float[Tensor, "n o S S"], *, cells: int) -> Float[Tensor,
     return avg_pool2d(energy, size // cells)
 
 
-def smoothed(histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n o h w"]:
+def smooth_histograms(histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n o h w"]:
     """Weighted (1 2 1) / 4 with the neighbours along both axes: windows twice a cell wide that overlap by half."""
     h, w = histograms.shape[2:]
     x = pad(histograms, (1, 1, 1, 1))
@@ -76,7 +76,9 @@ def smoothed(histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n o h w"]:
     return (x.narrow(2, 0, h) + 2 * x.narrow(2, 1, h) + x.narrow(2, 2, h)) / 4
 
 
-def with_context(histograms: Float[Tensor, "n o h w"], *, distance: int, contrast: float) -> Float[Tensor, "n c h w"]:
+def append_neighbours(
+    histograms: Float[Tensor, "n o h w"], *, distance: int, contrast: float
+) -> Float[Tensor, "n c h w"]:
     """Each cell's histogram beside those of 8 neighbours, all scaled by one number to a length of 1 where energy is.
 
     The length is sqrt(energy^2 + ``contrast``^2): flat cells stay near zero (L2 norm of Dalal and Triggs, Sec. 6.4).

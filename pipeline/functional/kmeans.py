@@ -23,7 +23,7 @@ def kmeans(
     ``iterations`` are done. Runs on the CPU: sums on other devices depend on their order.
     """
     x = points.cpu()
-    centre = x[torch.from_numpy(spread_start(x.numpy(), count=count, seed=seed))]
+    centre = x[torch.from_numpy(kmeans_plus_plus(x.numpy(), count=count, seed=seed))]
     label = _nearest_centre(x, centre)
     for _ in range(iterations):
         centre = _means(x, label, centre)
@@ -34,7 +34,7 @@ def kmeans(
     return label.to(points.device), _means(x, label, centre[used]).to(points.device)
 
 
-def spread_start(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -> Int[np.ndarray, " k"]:
+def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -> Int[np.ndarray, " k"]:
     """Indices of k-means++ seeds: each drawn with probability proportional to its squared distance to those before.
 
     Fewer than ``count`` where there are fewer distinct points.

@@ -21,7 +21,7 @@ def root_mean_square_norm(samples: Float[Tensor, "m c"]) -> Float[Tensor, ""]:
     return torch.where(norm > 0, norm, torch.ones_like(norm))
 
 
-def side_by_side(
+def concatenate_normalized(
     first: Float[Tensor, "n c h w"], second: Float[Tensor, "n d y x"], *, alpha: float
 ) -> Float[Tensor, "n e h w"]:
     """Both maps on the first's cells, float32: each of length 1 in every cell, times ``alpha`` and 1 - ``alpha``.

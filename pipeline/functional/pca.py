@@ -46,7 +46,7 @@ def principal_axes_in_blocks(
     return mean.float(), _signed(axes)
 
 
-def projected(
+def project_onto_axes(
     samples: Float[Tensor, "m c"], mean: Float[Tensor, " c"], axes: Float[Tensor, "c k"], *, block: int = 1 << 13
 ) -> Float[Tensor, "m k"]:
     """Coordinates of samples, less the mean, on the axes, in float32."""

@@ -10,7 +10,7 @@ from pipeline.functional.camera import project
 from pipeline.functional.rigid import nearest_rotation, rigid, transform
 
 
-def pose_of(rvec: Float[np.ndarray, "3 1"], tvec: Float[np.ndarray, "3 1"]) -> Float[np.ndarray, "4 4"] | None:
+def pose_from_opencv(rvec: Float[np.ndarray, "3 1"], tvec: Float[np.ndarray, "3 1"]) -> Float[np.ndarray, "4 4"] | None:
     """T_cam_obj of OpenCV's rotation vector and translation, None when they are not finite."""
     if not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
         return None
@@ -49,12 +49,12 @@ def least_squares_pose(
     """The pose of least squared reprojection error near a pose, by Levenberg-Marquardt; None when that diverges."""
     rvec, tvec = cv2.Rodrigues(T_cam_obj[:3, :3])[0], T_cam_obj[:3, 3:].copy()
     try:
-        return pose_of(*cv2.solvePnPRefineLM(points_obj, px, K, None, rvec, tvec, CONVERGED))
+        return pose_from_opencv(*cv2.solvePnPRefineLM(points_obj, px, K, None, rvec, tvec, CONVERGED))
     except cv2.error:
         return None
 
 
-def polished(
+def polish(
     points_obj: Float[np.ndarray, "m 3"],
     px: Float[np.ndarray, "m 2"],
     K: Float[np.ndarray, "3 3"],

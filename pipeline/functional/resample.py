@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from pipeline.functional.camera import apply, local_zoom
+from pipeline.functional.camera import apply_homography, local_zoom
 
 _FINEST = 16  # samples a side of a crop pixel at most: a crop that shrinks by more shows nothing anyway
 
@@ -43,7 +43,9 @@ def warp(
     n = int(np.clip(np.ceil(local_zoom(A_img_crop, corners).max() - 1e-6), 1, _FINEST))
     offsets = (np.arange(n) + 0.5) / n - 0.5
     pixels = np.pad(image.reshape(*image.shape[:2], -1).astype(np.float32), ((2, 2), (2, 2), (0, 0)))
-    samples = (_bilinear(pixels, apply(A_img_crop, grid + np.array([x, y]))) for y in offsets for x in offsets)
+    samples = (
+        _bilinear(pixels, apply_homography(A_img_crop, grid + np.array([x, y]))) for y in offsets for x in offsets
+    )
     total = sum(samples, np.zeros((size * size, pixels.shape[2]), np.float32))
     return (total / np.float32(n * n)).reshape(size, size, *image.shape[2:])
 

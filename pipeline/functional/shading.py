@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-PLAIN = 178  # grey of a mesh without colours, of 255
+DEFAULT_GREY = 178  # grey of a mesh without colours, of 255
 
 
 def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
@@ -47,7 +47,7 @@ def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
-def lit(
+def shade(
     albedo: Float[np.ndarray, "*n 3"],
     normal: Float[np.ndarray, "*n 3"],
     to_light: Float[np.ndarray, "*n 3"],

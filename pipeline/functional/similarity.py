@@ -13,7 +13,7 @@ _PAIRS_BLOCK = 1 << 22  # cell pairs compared at a time
 _EVEN = 4  # labels of up to this many times the mean number of rows are compared as they are, larger ones in parts
 
 
-def unit(x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+def l2_normalize(x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
     """Rows of length 1; a row of zeros stays."""
     return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
 
@@ -25,7 +25,7 @@ def global_cosine(
 
     ``norm``: the bank's ``map_norms``, which take as long as all the rest, where they are known.
     """
-    q = unit(query.float().flatten())
+    q = l2_normalize(query.float().flatten())
     dot = torch.cat([block.flatten(1) @ q for block in _float_blocks(bank)])
     return _divided(dot, map_norms(bank) if norm is None else norm)
 
@@ -37,7 +37,7 @@ def map_norms(bank: Float[Tensor, "n c h w"]) -> Float[Tensor, " n"]:
 
 def cell_cosine(query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"]) -> Float[Tensor, "n h w"]:
     """Cosine of every cell of the query with the same cell of each map of the bank, 0 for cells of zeros."""
-    q = unit(query.float().movedim(0, -1)).movedim(-1, 0).contiguous()
+    q = l2_normalize(query.float().movedim(0, -1)).movedim(-1, 0).contiguous()
     dot, norm = [], []
     for block in _float_blocks(bank):
         dot.append((block * q).sum(1))
@@ -45,7 +45,7 @@ def cell_cosine(query: Float[Tensor, "c h w"], bank: Float[Tensor, "n c h w"]) -
     return _divided(torch.cat(dot), torch.cat(norm))
 
 
-def masked_mean(
+def sum_over_count(
     values: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"], *, over: Float[Tensor, " n"]
 ) -> Float[Tensor, " n"]:
     """Sum inside the mask over the given cell counts; 0 where the count is 0."""
@@ -60,7 +60,7 @@ def mutual_nearest(similarity: Float[Tensor, "a b"]) -> Int[Tensor, "p 2"]:
     return torch.stack([row[mutual], column[mutual]], dim=1)
 
 
-def nearest_of_label(
+def nearest_with_same_label(
     a: Float[Tensor, "m c"], a_label: Int[Tensor, " m"], b: Float[Tensor, "n c"], b_label: Int[Tensor, " n"]
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
     """Similarity a.b and index of the row of b most similar to each row of a among those with its label.

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 
 _BLOCK = 1 << 13  # descriptors compared with all words at a time
 
@@ -35,9 +35,9 @@ def soft_weights(squared: Float[Tensor, "m k"], *, sigma_squared: float | None) 
     Philbin et al., "Lost in Quantization", CVPR 2008, section 4; length 1, not sum 1, as FoundPose's code has it.
     """
     if sigma_squared is None:
-        return unit(torch.ones_like(squared))
+        return l2_normalize(torch.ones_like(squared))
     nearest = squared.min(1, keepdim=True).values  # shifts the exponent, which the length takes out again
-    return unit(torch.exp((nearest - squared) / (2 * sigma_squared)))
+    return l2_normalize(torch.exp((nearest - squared) / (2 * sigma_squared)))
 
 
 def word_counts(

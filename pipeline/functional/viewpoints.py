@@ -26,10 +26,10 @@ def viewpoint_rotations(name: ViewpointSet, n: int, inplane: int = 1) -> Float[n
     else:
         directions = fibonacci(n) if name == "fibonacci" else icosphere(_LEVEL)
         R = look_at(directions[directions[:, 2] > 0] if name == "icosphere_upper" else directions)[:, :3, :3]
-    return with_inplane(R, inplane)
+    return add_inplane_turns(R, inplane)
 
 
-def with_inplane(R_cam_obj: Float[np.ndarray, "n 3 3"], turns: int) -> Float[np.ndarray, "m 3 3"]:
+def add_inplane_turns(R_cam_obj: Float[np.ndarray, "n 3 3"], turns: int) -> Float[np.ndarray, "m 3 3"]:
     """Every rotation at ``turns`` equal turns about the camera's optical axis, m = n turns, the unturned one first."""
     angle = 2 * np.pi * np.arange(turns) / turns
     c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros(turns), np.ones(turns)
@@ -43,10 +43,10 @@ def icosphere(level: int) -> Float[np.ndarray, "n 3"]:
     A corner lies on +z (the orientation Blender gives an icosphere); level 2 then has 40 vertices on the horizon and
     301 above it. In the orientation of golden rectangles there would be 32 on it and 305 above.
     """
-    return unit_sphere(level)[0]
+    return icosphere_mesh(level)[0]
 
 
-def unit_sphere(level: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def icosphere_mesh(level: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Vertices and outward-wound faces of ``icosphere(level)``."""
     points, faces = _icosahedron()
     for _ in range(level + 1):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from pipeline.bop.masks import decode
 from pipeline.errors import BadInput, NoPose
-from pipeline.functional.descriptors import pooled
+from pipeline.functional.descriptors import pool_foreground
 from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.tasks import Advance, Work
 from pipeline.graph.templates import TemplateNodes
@@ -189,7 +189,7 @@ class ProposalNodes:
 
     def _descriptors(self, crops: Ref, features: Ref) -> Float[torch.Tensor, "n c"]:
         maps = self.run.tensor(self.run.store.read(features).array("maps"))
-        return pooled(maps, self.run.tensor(self.run.store.read(crops).array("mask")))
+        return pool_foreground(maps, self.run.tensor(self.run.store.read(crops).array("mask")))
 
 
 def proposal_nodes(run: Context) -> ProposalNodes | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.functional.camera import apply, unproject
+from pipeline.functional.camera import apply_homography, unproject
 from pipeline.functional.rigid import inverse, transform
 
 
@@ -21,7 +21,7 @@ def lift(
     On the exact ray of the pixel, at the depth of the nearest pixel; NaN where that depth is 0.
     Raises ValueError for a point outside the depth map.
     """
-    px = apply(np.linalg.inv(A_crop_img), np.asarray(px_crop, dtype=np.float64))
+    px = apply_homography(np.linalg.inv(A_crop_img), np.asarray(px_crop, dtype=np.float64))
     column, row = np.floor(px + 0.5).astype(np.int64).T
     height, width = depth_mm.shape
     outside = (column < 0) | (column >= width) | (row < 0) | (row >= height)

@@ -8,7 +8,7 @@ from hashlib import sha256
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.functional.viewpoints import unit_sphere
+from pipeline.functional.viewpoints import icosphere_mesh
 from pipeline.io.meshes import diameter_mm
 from pipeline.items.objects import Mesh
 from pipeline.synthetic.parts import (
@@ -47,7 +47,7 @@ def make_object(seed: int) -> Mesh:
 
 def _pebble(rng: Rng) -> Shape:
     """A sphere displaced by smooth noise, stretched along its axes."""
-    points, faces = unit_sphere(4)
+    points, faces = icosphere_mesh(4)
     radius = 1 + 0.35 * noise(points, rng, scale=0.9) + 0.1 * noise(points, rng, scale=0.35)
     return points * np.maximum(radius, 0.3)[:, None] * rng.uniform(0.6, 1.2, 3), faces
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.functional.viewpoints import unit_sphere
+from pipeline.functional.viewpoints import icosphere_mesh
 
 Shape = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
 Rng = np.random.Generator
@@ -14,7 +14,7 @@ Rng = np.random.Generator
 def superquadric(rng: Rng, size: Float[np.ndarray, " 3"], roundness: float | None = None, level: int = 3) -> Shape:
     """|x|^p + |y|^p + |z|^p = 1 with p = 2 / roundness, scaled; 1 is an ellipsoid, 0.2 nearly a box."""
     power = 2 / (rng.uniform(0.3, 1.2) if roundness is None else roundness)
-    points, faces = unit_sphere(level)
+    points, faces = icosphere_mesh(level)
     return points / (np.abs(points) ** power).sum(axis=-1, keepdims=True) ** (1 / power) * size, faces
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pipeline.functional.binning import bin_count, log_binned
+from pipeline.functional.binning import bin_count, log_bin
 
 
 def by_loops(maps: torch.Tensor, hierarchy: int) -> torch.Tensor:
@@ -29,7 +29,7 @@ def by_loops(maps: torch.Tensor, hierarchy: int) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(7, 9), (2, 3), (1, 1)])
 def test_bins_equal_a_direct_loop(hierarchy: int, size: tuple[int, int]):
     maps = torch.randn((2, 3, *size), generator=torch.Generator().manual_seed(0))
-    binned = log_binned(maps, hierarchy=hierarchy)
+    binned = log_bin(maps, hierarchy=hierarchy)
     assert binned.shape == (2, 3 * bin_count(hierarchy), *size)
     # means of at most 81 float32 values, summed in another order
     torch.testing.assert_close(binned, by_loops(maps, hierarchy), rtol=1e-5, atol=1e-6)
@@ -37,13 +37,13 @@ def test_bins_equal_a_direct_loop(hierarchy: int, size: tuple[int, int]):
 
 def test_the_fifth_bin_is_the_cell_itself():
     maps = torch.randn(1, 2, 5, 5)
-    assert torch.equal(log_binned(maps, hierarchy=2)[:, 8:10], maps)
+    assert torch.equal(log_bin(maps, hierarchy=2)[:, 8:10], maps)
 
 
 def test_the_same_everywhere_stays_the_same():
-    torch.testing.assert_close(log_binned(torch.full((1, 1, 4, 6), 3.0), hierarchy=2), torch.full((1, 17, 4, 6), 3.0))
+    torch.testing.assert_close(log_bin(torch.full((1, 1, 4, 6), 3.0), hierarchy=2), torch.full((1, 17, 4, 6), 3.0))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_binned_too(dtype: torch.dtype):
-    assert log_binned(torch.randn(1, 2, 4, 4).to(dtype), hierarchy=2).dtype == dtype
+    assert log_bin(torch.randn(1, 2, 4, 4).to(dtype), hierarchy=2).dtype == dtype

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.functional.boxes import area, iou, not_suppressed
+from pipeline.functional.boxes import area, iou, non_maximum_suppression
 
 
 def some_boxes(n: int, seed: int = 0) -> np.ndarray:
@@ -32,15 +32,15 @@ def suppressed_by_loop(boxes: np.ndarray, score: np.ndarray, max_iou: float) -> 
 def test_suppression_is_that_of_a_loop_over_masks(max_iou: float):
     boxes, score = some_boxes(80), np.random.default_rng(1).random(80)
     np.testing.assert_array_equal(
-        not_suppressed(boxes, score, max_iou=max_iou), suppressed_by_loop(boxes, score, max_iou)
+        non_maximum_suppression(boxes, score, max_iou=max_iou), suppressed_by_loop(boxes, score, max_iou)
     )
 
 
 def test_order_of_boxes_changes_nothing():
     boxes, score = some_boxes(50), np.random.default_rng(1).permutation(50) / 50
     order = np.random.default_rng(2).permutation(50)
-    kept = not_suppressed(boxes, score, max_iou=0.3)
-    np.testing.assert_array_equal(not_suppressed(boxes[order], score[order], max_iou=0.3), kept[order])
+    kept = non_maximum_suppression(boxes, score, max_iou=0.3)
+    np.testing.assert_array_equal(non_maximum_suppression(boxes[order], score[order], max_iou=0.3), kept[order])
 
 
 def test_overlap_is_that_of_pixels():
@@ -52,9 +52,9 @@ def test_overlap_is_that_of_pixels():
 
 def test_of_equal_scores_the_first_stays():
     boxes = np.repeat(some_boxes(1), 3, axis=0)
-    assert not_suppressed(boxes, np.ones(3), max_iou=0.5).tolist() == [True, False, False]
+    assert non_maximum_suppression(boxes, np.ones(3), max_iou=0.5).tolist() == [True, False, False]
 
 
 def test_boxes_without_area_and_no_boxes_at_all_are_no_fault():
     assert iou(np.zeros(4), np.zeros((2, 4))).tolist() == [0, 0]
-    assert not_suppressed(np.zeros((0, 4)), np.zeros(0), max_iou=0.5).tolist() == []
+    assert non_maximum_suppression(np.zeros((0, 4)), np.zeros(0), max_iou=0.5).tolist() == []

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.functional.camera import apply, crop_camera, local_zoom, project, square_crop, virtual_crop
+from pipeline.functional.camera import apply_homography, crop_camera, local_zoom, project, square_crop, virtual_crop
 from pipeline.functional.resample import resample, warp
 from pipeline.functional.rigid import rotation_between
 
@@ -17,17 +17,19 @@ def test_pixels_move_as_homogeneous_points_and_an_affine_map_divides_by_nothing(
     px = np.random.default_rng(1).uniform(0, 600, (20, 2))
     A = virtual_crop(BOX, K, size=128, padding_ratio=1.2)
     homogeneous = np.concatenate([px, np.ones((20, 1))], axis=1) @ A.T
-    np.testing.assert_allclose(apply(A, px), homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-12)
+    np.testing.assert_allclose(apply_homography(A, px), homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-12)
     square = square_crop(BOX, size=128, padding_ratio=1.2)
-    assert np.array_equal(apply(square, px), px @ square[:2, :2].T + square[:2, 2])
-    np.testing.assert_allclose(apply(np.linalg.inv(A), apply(A, px)), px, atol=1e-7)
+    assert np.array_equal(apply_homography(square, px), px @ square[:2, :2].T + square[:2, 2])
+    np.testing.assert_allclose(apply_homography(np.linalg.inv(A), apply_homography(A, px)), px, atol=1e-7)
 
 
 def test_points_projected_through_the_virtual_camera_are_their_pixels_moved_to_the_crop():
     A = virtual_crop(BOX, K, size=128, padding_ratio=1.2)
     K_crop, R_crop_cam = crop_camera(A, K)
     points = _points()
-    np.testing.assert_allclose(project(K_crop, points @ R_crop_cam.T), apply(A, project(K, points)), atol=1e-8)
+    np.testing.assert_allclose(
+        project(K_crop, points @ R_crop_cam.T), apply_homography(A, project(K, points)), atol=1e-8
+    )
     ray = np.linalg.inv(K) @ [560.5, 60.5, 1.0]
     np.testing.assert_allclose(R_crop_cam, rotation_between(ray, np.array([0.0, 0, 1])), atol=1e-12)
     np.testing.assert_allclose(K_crop, [[K_crop[0, 0], 0, 63.5], [0, K_crop[0, 0], 63.5], [0, 0, 1]], atol=1e-9)
@@ -35,9 +37,9 @@ def test_points_projected_through_the_virtual_camera_are_their_pixels_moved_to_t
 
 def test_the_padded_box_fills_the_virtual_crop_and_its_centre_is_the_crops():
     A = virtual_crop(BOX, K, size=128, padding_ratio=1.25)
-    np.testing.assert_allclose(apply(A, np.array([560.5, 60.5])), [63.5, 63.5], atol=1e-9)
+    np.testing.assert_allclose(apply_homography(A, np.array([560.5, 60.5])), [63.5, 63.5], atol=1e-9)
     corners = np.array([[x, y] for x in (510.5, 610.5) for y in (10.5, 110.5)])  # 1.25 times 80 px
-    at = np.abs(apply(A, corners) - 63.5)
+    at = np.abs(apply_homography(A, corners) - 63.5)
     assert at.max() == pytest.approx(64)
     assert at.min() > 50  # seen from 27 degrees aside, the square is a trapezoid
 
@@ -67,7 +69,7 @@ def test_a_crop_that_scales_and_shifts_is_a_camera_that_has_not_turned():
 
 def test_local_zoom_is_what_a_small_square_grows_by():
     A, px, step = virtual_crop(BOX, K, size=128, padding_ratio=1.2), np.array([[530.0, 40.0], [590.0, 80.0]]), 1e-4
-    dx, dy = ((apply(A, px + d) - apply(A, px - d)) / (2 * step) for d in ((step, 0), (0, step)))
+    dx, dy = ((apply_homography(A, px + d) - apply_homography(A, px - d)) / (2 * step) for d in ((step, 0), (0, step)))
     area = np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
     np.testing.assert_allclose(local_zoom(A, px), np.sqrt(area), rtol=1e-6)
     assert local_zoom(3.0 * square_crop(BOX, size=128, padding_ratio=1.0), px) == pytest.approx(128 / 80)
@@ -83,7 +85,7 @@ def test_a_warped_ramp_keeps_its_values_at_the_crops_pixel_centres(side):
     ramp = np.add.outer(0.5 * np.arange(480), 0.25 * np.arange(640)).astype(np.float32)
     A = virtual_crop((400.0, 100.0, 400.0 + side, 100.0 + side), K, size=40, padding_ratio=1.0)
     grid = np.stack(np.meshgrid(np.arange(40), np.arange(40)), -1).astype(float)
-    px = apply(np.linalg.inv(A), grid)
+    px = apply_homography(np.linalg.inv(A), grid)
     expected = 0.5 * px[..., 1] + 0.25 * px[..., 0]
     # shrunk: samples spread over a pixel of a map that is no more affine there
     assert np.abs(warp(ramp, A, size=40) - expected).max() < 5e-3

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from pipeline.functional import camera, featuremetric
-from pipeline.functional.featuremetric import Field, Robust, Surface
+from pipeline.functional.featuremetric import FeatureField, RobustLoss, Surface
 from pipeline.functional.rigid import look_at, transform
 
 H, W, C = 18, 22, 5
@@ -21,11 +21,11 @@ def smooth_map(seed: int) -> np.ndarray:
     return np.stack(waves, axis=-1).astype(np.float32) + 0.5
 
 
-def scene(*, directions: bool) -> tuple[Surface, Field]:
+def scene(*, directions: bool) -> tuple[Surface, FeatureField]:
     rng = np.random.default_rng(0)
     points, d = rng.uniform(-40, 40, (60, 3)), rng.normal(size=(60, C)).astype(np.float32)
-    d = featuremetric.unit(d) if directions else d
-    field = Field.of(smooth_map(1), np.ones((H, W), bool), directions=directions)
+    d = featuremetric.l2_normalize(d) if directions else d
+    field = FeatureField.of(smooth_map(1), np.ones((H, W), bool), directions=directions)
     return Surface(points, d, np.full(60, 2.0)), field
 
 
@@ -37,7 +37,7 @@ def test_derivatives_of_a_projection_by_a_homography_are_those_of_finite_differe
         h = 1e-4 * np.eye(6)[k]
         ends = [
             featuremetric.project_cells(
-                K_CELL, transform(featuremetric.moved(T, centre, sign * h), points), np.zeros(3)
+                K_CELL, transform(featuremetric.apply_increment(T, centre, sign * h), points), np.zeros(3)
             )[0]
             for sign in (1, -1)
         ]
@@ -48,12 +48,14 @@ def test_derivatives_of_a_projection_by_a_homography_are_those_of_finite_differe
 @pytest.mark.parametrize("directions", [False, True])
 def test_gradient_of_the_cost_is_that_of_finite_differences(alpha, directions):
     surface, field = scene(directions=directions)
-    robust = Robust(alpha, 0.7)
+    robust = RobustLoss(alpha, 0.7)
     _, _, gradient, centre = featuremetric.normal_equations(surface, field, K_CELL, T, robust)
     for k in range(6):
         h = (1e-3 if k < 3 else 1e-5) * np.eye(6)[k]  # mm and radians: some 1e-4 of a cell, above float32's rounding
         ends = [
-            featuremetric.normal_equations(surface, field, K_CELL, featuremetric.moved(T, centre, s * h), robust)[0]
+            featuremetric.normal_equations(
+                surface, field, K_CELL, featuremetric.apply_increment(T, centre, s * h), robust
+            )[0]
             for s in (1, -1)
         ]
         # a few of the points cross from one square of cells to the next, where bilinear maps have a kink
@@ -62,11 +64,11 @@ def test_gradient_of_the_cost_is_that_of_finite_differences(alpha, directions):
 
 def test_a_map_that_is_linear_in_place_is_read_exactly():
     y, x = np.mgrid[:H, :W].astype(np.float32)
-    field = Field.of(np.stack([x, 2 * y, x - y], axis=-1), np.ones((H, W), bool))
+    field = FeatureField.of(np.stack([x, 2 * y, x - y], axis=-1), np.ones((H, W), bool))
     xy = np.random.default_rng(0).uniform(0, (W - 1, H - 1), (50, 2))
     true = np.stack([xy[:, 0], 2 * xy[:, 1], xy[:, 0] - xy[:, 1]], axis=1)
     asked = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
-    found = featuremetric.read(field, xy, asked)
+    found = featuremetric.residuals_at(field, xy, asked)
     J = np.array([[1.0, 0.0], [0.0, 2.0], [1.0, -1.0]])
     np.testing.assert_allclose(found.squared, np.square(true - asked).sum(1), rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(found.pull, (true - asked) @ J, rtol=1e-4, atol=1e-3)
@@ -75,7 +77,7 @@ def test_a_map_that_is_linear_in_place_is_read_exactly():
 
 @LOSSES
 def test_weight_is_twice_the_derivative_of_the_loss(alpha):
-    robust, squared = Robust(alpha, 0.4), np.linspace(0, 3, 31)
+    robust, squared = RobustLoss(alpha, 0.4), np.linspace(0, 3, 31)
     slope = (robust.cost(squared + 1e-6) - robust.cost(squared - 1e-6)) / 1e-6
     np.testing.assert_allclose(robust.weight(squared), slope, rtol=1e-6)
     assert robust.cost(np.zeros(1)) == 0
@@ -89,18 +91,18 @@ def test_points_out_of_view_cost_what_an_unseen_point_costs_and_nothing_is_won_b
         squared, seen = featuremetric.squared_residuals(surface, field, K_CELL, away)
         assert not seen.any()
         assert (squared == surface.unseen).all()
-        cost, H_, g, _ = featuremetric.normal_equations(surface, field, K_CELL, away, Robust(-2.0, 0.5))
-        assert cost == pytest.approx(Robust(-2.0, 0.5).cost(np.array([2.0]))[0])
+        cost, H_, g, _ = featuremetric.normal_equations(surface, field, K_CELL, away, RobustLoss(-2.0, 0.5))
+        assert cost == pytest.approx(RobustLoss(-2.0, 0.5).cost(np.array([2.0]))[0])
         assert not H_.any()
         assert not g.any()
-        same = featuremetric.descend(surface, field, K_CELL, away, Robust(-2.0, 0.5), iterations=5)
+        same = featuremetric.descend(surface, field, K_CELL, away, RobustLoss(-2.0, 0.5), iterations=5)
         assert np.array_equal(same, away)
 
 
 @LOSSES
 def test_no_step_raises_the_cost(alpha):
     surface, field = scene(directions=True)
-    robust, costs, pose = Robust(alpha, 0.5), [], T
+    robust, costs, pose = RobustLoss(alpha, 0.5), [], T
     for _ in range(8):
         costs.append(featuremetric.normal_equations(surface, field, K_CELL, pose, robust)[0])
         pose = featuremetric.descend(surface, field, K_CELL, pose, robust, iterations=1)
@@ -113,13 +115,13 @@ def test_smoothing_heeds_the_foreground_alone():
     mask[5:12, 6:15] = True
     features = np.where(mask[..., None], np.float32(3.0), np.float32(-100.0)) * np.ones(C, np.float32)
     for sigma in (0.0, 1.0, 2.5):
-        found = featuremetric.smoothed(features, mask, sigma_cells=sigma)
+        found = featuremetric.smooth_foreground(features, mask, sigma_cells=sigma)
         np.testing.assert_allclose(found[4:13, 5:16], 3.0, rtol=1e-5)  # and carries it over the edge
     varied = smooth_map(2)
-    assert np.array_equal(featuremetric.smoothed(varied, mask, sigma_cells=0.0)[mask], varied[mask])
+    assert np.array_equal(featuremetric.smooth_foreground(varied, mask, sigma_cells=0.0)[mask], varied[mask])
 
 
 def test_cells_of_pixels_undo_pixels_of_cells():
     xy = np.random.default_rng(0).uniform(0, 60, (9, 2))
     px = camera.cell_to_px(torch.from_numpy(xy), size=420, cells=30).numpy()
-    np.testing.assert_allclose(camera.apply(camera.cell_affine(size=420, cells=30), px), xy, atol=1e-9)
+    np.testing.assert_allclose(camera.apply_homography(camera.cell_affine(size=420, cells=30), px), xy, atol=1e-9)

@@ -1,13 +1,13 @@
 import torch
 from sklearn.cluster import KMeans
 
-from pipeline.functional.kmeans import kmeans, spread_start
-from pipeline.functional.similarity import unit
+from pipeline.functional.kmeans import kmeans, kmeans_plus_plus
+from pipeline.functional.similarity import l2_normalize
 
 
 def _points(m: int = 600, c: int = 16) -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
-    return unit(torch.randn(m, 4, generator=generator) @ torch.randn(4, c, generator=generator))
+    return l2_normalize(torch.randn(m, 4, generator=generator) @ torch.randn(4, c, generator=generator))
 
 
 def test_same_seed_gives_the_same_bytes_and_another_seed_another_start():
@@ -15,7 +15,9 @@ def test_same_seed_gives_the_same_bytes_and_another_seed_another_start():
     first, again = (kmeans(points.clone(), count=40, seed=3, iterations=20) for _ in range(2))
     assert torch.equal(first[0], again[0])
     assert torch.equal(first[1], again[1])
-    assert spread_start(points.numpy(), count=40, seed=3)[0] != spread_start(points.numpy(), count=40, seed=4)[0]
+    assert (
+        kmeans_plus_plus(points.numpy(), count=40, seed=3)[0] != kmeans_plus_plus(points.numpy(), count=40, seed=4)[0]
+    )
 
 
 def test_centres_are_means_and_every_point_has_the_nearest():
@@ -28,7 +30,7 @@ def test_centres_are_means_and_every_point_has_the_nearest():
 
 
 def test_separate_groups_are_found():
-    groups = unit(torch.eye(5, 8)).repeat_interleave(30, 0) + 0.01 * _points(150, 8)
+    groups = l2_normalize(torch.eye(5, 8)).repeat_interleave(30, 0) + 0.01 * _points(150, 8)
     label, _ = kmeans(groups, count=5, seed=0, iterations=20)
     assert all(len(label[i * 30 : i * 30 + 30].unique()) == 1 for i in range(5))
     assert len(label.unique()) == 5

@@ -3,7 +3,7 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from pipeline.functional.pca import principal_axes, principal_axes_in_blocks, projected
+from pipeline.functional.pca import principal_axes, principal_axes_in_blocks, project_onto_axes
 
 
 def _samples(m: int, c: int) -> torch.Tensor:
@@ -59,5 +59,5 @@ def test_axes_in_blocks_equal_those_of_scikit_learn_whatever_the_blocks(m, c):
         assert np.allclose(mean.numpy(), reference.mean_, atol=1e-6)
         assert (np.abs(np.sum(axes.numpy() * reference.components_.T, axis=0)) > 1 - 1e-6).all()
         expected = reference.transform(samples.double().numpy())
-        found = projected(samples, mean, axes, block=block).numpy()
+        found = project_onto_axes(samples, mean, axes, block=block).numpy()
         assert np.allclose(found, np.sign((found * expected).sum(0)) * expected, atol=1e-4)  # float32 of values about 5

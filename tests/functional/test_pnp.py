@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 
 from pipeline.functional.camera import project
-from pipeline.functional.pnp import least_squares_pose, polished, reprojection_error_px, truncated_cost
+from pipeline.functional.pnp import least_squares_pose, polish, reprojection_error_px, truncated_cost
 from pipeline.functional.rigid import rigid, transform
 
 K = np.array([[600.0, 0.0, 320.0], [0.0, 610.0, 240.0], [0.0, 0.0, 1.0]])
@@ -29,7 +29,7 @@ def test_polish_never_raises_the_truncated_cost():
     for angle in (0.0, 0.01, 0.05, 1.5):
         start = _turned(T, angle, 100 * angle)
         before = truncated_cost(reprojection_error_px(_points(), px, K, start), threshold_px=8.0)
-        end = polished(_points(), px, K, start, threshold_px=8.0)
+        end = polish(_points(), px, K, start, threshold_px=8.0)
         assert truncated_cost(reprojection_error_px(_points(), px, K, end), threshold_px=8.0) <= before
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 
-from pipeline.functional.shading import corner_normals, lit, mip_levels, texel_density, texture_colour
-from pipeline.functional.viewpoints import unit_sphere
+from pipeline.functional.shading import corner_normals, mip_levels, shade, texel_density, texture_colour
+from pipeline.functional.viewpoints import icosphere_mesh
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 CUBE_FACES = np.array(
@@ -14,7 +14,7 @@ CUBE_FACES = np.array(
 
 
 def test_a_sphere_is_smooth_and_a_cube_keeps_its_edges():
-    points, faces = unit_sphere(2)
+    points, faces = icosphere_mesh(2)
     smooth = corner_normals(points, faces, crease_deg=40.0)
     # faces around a vertex are not quite regular: about half a degree
     assert ((smooth * points[faces]).sum(-1) > np.cos(np.radians(1.0))).all()
@@ -23,7 +23,7 @@ def test_a_sphere_is_smooth_and_a_cube_keeps_its_edges():
 
 
 def test_copies_of_a_vertex_on_a_seam_share_its_normal():
-    points, faces = unit_sphere(1)
+    points, faces = icosphere_mesh(1)
     torn = corner_normals(points[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3), crease_deg=40.0)
     np.testing.assert_allclose(
         torn, corner_normals(points, faces, crease_deg=40.0), atol=1e-12
@@ -33,7 +33,7 @@ def test_copies_of_a_vertex_on_a_seam_share_its_normal():
 def test_light_falls_from_both_sides_and_needs_no_unit_vectors():
     albedo = np.full((3, 3), 100.0)
     normal, light = np.array([[0, 0, 2.0], [0, 0, -5], [1, 0, 0]]), np.array([0, 0, -3.0])
-    colour = lit(albedo, normal, np.broadcast_to(light, (3, 3)), ambient=0.4, diffuse=0.5)
+    colour = shade(albedo, normal, np.broadcast_to(light, (3, 3)), ambient=0.4, diffuse=0.5)
     np.testing.assert_allclose(colour[:, 0], [90, 90, 40])
 
 

@@ -6,9 +6,9 @@ from pipeline.functional.similarity import (
     best_per_group,
     cell_cosine,
     global_cosine,
+    l2_normalize,
     mutual_nearest,
-    nearest_of_label,
-    unit,
+    nearest_with_same_label,
 )
 
 
@@ -54,12 +54,12 @@ def test_mutual_nearest_pairs_are_best_in_row_and_column():
 
 
 def test_nearest_of_label_equals_a_loop(monkeypatch):
-    a, b = unit(_random(40, 5)), unit(_random(30, 5, seed=1))
+    a, b = l2_normalize(_random(40, 5)), l2_normalize(_random(30, 5, seed=1))
     generator = torch.Generator().manual_seed(2)
     a_label, b_label = torch.randint(0, 6, (40,), generator=generator), torch.randint(0, 5, (30,), generator=generator)
     for block in (1 << 22, 1 << 7, 8):
         monkeypatch.setattr(similarity, "_PAIRS_BLOCK", block)
-        value, index = nearest_of_label(a, a_label, b, b_label)
+        value, index = nearest_with_same_label(a, a_label, b, b_label)
         for i in range(40):
             members = [j for j in range(30) if b_label[j] == a_label[i]]
             if not members:
@@ -71,10 +71,10 @@ def test_nearest_of_label_equals_a_loop(monkeypatch):
 
 
 def test_a_label_far_larger_than_the_others_is_compared_in_parts():
-    a, b = unit(_random(300, 5)), unit(_random(200, 5, seed=1))
+    a, b = l2_normalize(_random(300, 5)), l2_normalize(_random(200, 5, seed=1))
     a_label, b_label = (torch.arange(n).sub(n - 30).clamp(min=0) for n in (300, 200))  # 0 but for the last 29
     similarity_matrix = (a @ b.T).masked_fill(a_label[:, None] != b_label, -torch.inf)
-    value, index = nearest_of_label(a, a_label, b, b_label)
+    value, index = nearest_with_same_label(a, a_label, b, b_label)
     assert torch.equal(index, similarity_matrix.argmax(1))
     assert torch.allclose(value, similarity_matrix.max(1).values, atol=1e-6)  # float32, another order of sums
 
@@ -87,7 +87,7 @@ def test_best_per_group_keeps_the_highest_and_of_equals_the_first():
 
 
 def test_nothing_to_compare_gives_nothing():
-    value, index = nearest_of_label(
+    value, index = nearest_with_same_label(
         torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(2, 3), torch.tensor([0, 1])
     )
     assert len(value) == len(index) == 0

@@ -1,6 +1,6 @@
 import torch
 
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 from pipeline.functional.subpixel import neighbourhood_shift
 
 _CELLS = 24
@@ -12,7 +12,7 @@ def _field(dx: float = 0.0, dy: float = 0.0) -> torch.Tensor:
     wave, phase = torch.randn(16, 20, 2, generator=generator), 6.28 * torch.rand(16, 20, generator=generator)
     y, x = torch.meshgrid(torch.arange(_CELLS) + dy, torch.arange(_CELLS) + dx, indexing="ij")
     waves = torch.einsum("ckd,hwd->hwck", wave, torch.stack([x, y], -1).float())
-    return unit(torch.cos(waves + phase).sum(-1))
+    return l2_normalize(torch.cos(waves + phase).sum(-1))
 
 
 def _disc() -> torch.Tensor:

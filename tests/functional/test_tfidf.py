@@ -3,7 +3,7 @@ import pytest
 import torch
 from sklearn.feature_extraction.text import TfidfTransformer
 
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 from pipeline.functional.tfidf import inverse_frequency, nearest_words, soft_weights, word_counts
 
 DOCUMENTS, WORDS = 7, 12
@@ -50,7 +50,7 @@ def test_tfidf_is_scikit_learns_without_the_one_added_to_idf():
     squared, index = nearest_words(points, words, count=3)
     soft = word_counts(index, soft_weights(squared, sigma_squared=4.0), document, documents=DOCUMENTS, words=WORDS)
     reference.idf_ = idf.numpy()
-    assert np.allclose(unit(soft * idf), reference.transform(soft.numpy()).toarray(), atol=1e-6)
+    assert np.allclose(l2_normalize(soft * idf), reference.transform(soft.numpy()).toarray(), atol=1e-6)
 
 
 def test_a_word_of_every_document_weighs_nothing():

@@ -3,12 +3,12 @@ import pytest
 
 from pipeline.functional.rigid import rotation_angle_deg
 from pipeline.functional.viewpoints import (
+    add_inplane_turns,
     fibonacci,
     icosphere,
+    icosphere_mesh,
     superfibonacci,
-    unit_sphere,
     viewpoint_rotations,
-    with_inplane,
 )
 
 SETS = ("icosphere_upper", "icosphere", "fibonacci", "superfibonacci")
@@ -55,7 +55,7 @@ def test_levels_0_and_1_have_42_and_162_directions():
 
 
 def test_sphere_is_closed_and_wound_outwards():
-    points, faces = unit_sphere(1)
+    points, faces = icosphere_mesh(1)
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     a, b, c = (points[faces[:, k]] for k in range(3))
@@ -92,7 +92,7 @@ def test_superfibonacci_covers_all_rotations_more_evenly_than_chance():
 
 def test_inplane_turns_keep_the_viewing_direction_and_close_the_circle():
     R = viewpoint_rotations("fibonacci", 7)
-    turned = with_inplane(R, 4).reshape(7, 4, 3, 3)
+    turned = add_inplane_turns(R, 4).reshape(7, 4, 3, 3)
     np.testing.assert_allclose(turned[:, 0], R, atol=1e-15)
     np.testing.assert_allclose(turned[..., 2, :], np.repeat(R[:, None, 2], 4, axis=1), atol=1e-15)
     np.testing.assert_allclose(rotation_angle_deg(turned[:, 1], turned[:, 2]), 90, atol=1e-9)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pipeline.errors import NoPose
-from pipeline.functional.similarity import unit
+from pipeline.functional.similarity import l2_normalize
 from pipeline.items.features import FusedPair
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.cluster.one import One
@@ -50,7 +50,7 @@ def test_shifted_template_has_the_same_clusters_shifted():
 def test_length_of_a_cells_feature_does_not_matter():
     pair = _pair()
     lengths = 0.1 + torch.rand(1, H, H, generator=torch.Generator().manual_seed(1))
-    flat = unit(pair.query.movedim(0, -1)).movedim(-1, 0)
+    flat = l2_normalize(pair.query.movedim(0, -1)).movedim(-1, 0)
     same = FusedPair(flat, flat, pair.query_mask, pair.template_mask)
     scaled = FusedPair(flat * lengths, flat * lengths, pair.query_mask, pair.template_mask)
     assert (KMeans(count=30)(same).query_label == KMeans(count=30)(scaled).query_label).float().mean() > 0.99  # ties
@@ -72,7 +72,7 @@ def test_clamped_clusters_and_a_skipped_epipolar_check_are_said():
 def test_clusters_off_the_epipolar_lines_are_dropped():
     """Two views with parallax: rows stay, columns move by a depth that varies; then some rows are exchanged."""
     generator = torch.Generator().manual_seed(0)
-    features = unit(torch.randn(32 * 32, 48, generator=generator))
+    features = l2_normalize(torch.randn(32 * 32, 48, generator=generator))
     row, column = torch.arange(1024) // 32, torch.arange(1024) % 32
     points = torch.randperm(1024, generator=generator)[:60]
     depth = torch.randint(0, 12, (60,), generator=generator)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BadInput, NoPose
-from pipeline.functional.camera import apply, crop_camera, local_zoom, project
+from pipeline.functional.camera import apply_homography, crop_camera, local_zoom, project
 from pipeline.spec import build
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
@@ -26,7 +26,7 @@ def test_image_enlarged_three_times_gives_the_same_crop():
     assert np.abs(crop.astype(int) - large).max() <= 1  # float32 sums may round a half the other way
     assert np.array_equal(crop_mask, large_mask)
     corner = np.array([[30.0, 20.0]])
-    assert np.allclose(apply(A, corner), apply(A_large, 3 * corner + 1), atol=1e-9)
+    assert np.allclose(apply_homography(A, corner), apply_homography(A_large, 3 * corner + 1), atol=1e-9)
 
 
 def test_image_moved_by_whole_pixels_gives_the_same_crop():
@@ -107,7 +107,7 @@ def test_a_turned_virtual_camera_sees_the_object_in_the_middle():
     rgb, mask = _scene()
     _, crop_mask, A = Virtual(size=60)(rgb, mask, WHOLE, K)
     assert A[2, 0] != 0  # K is wide: the mask's centre is 14 degrees off the axis
-    corners = apply(A, np.array([[29.5, 19.5], [69.5, 69.5]]))
+    corners = apply_homography(A, np.array([[29.5, 19.5], [69.5, 69.5]]))
     assert (corners > -0.5).all()
     assert (corners < 59.5).all()
     assert crop_mask.any(0).sum() > 35

@@ -26,7 +26,7 @@ def plane_view(T_cam_obj: np.ndarray, *, padding_ratio: float = 1.2, size: int =
     box = camera.mask_bbox(mask)
     A = camera.square_crop(box, size=size, padding_ratio=padding_ratio)
     grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2).astype(float)
-    px = np.rint(camera.apply(np.linalg.inv(A), grid)).astype(int)
+    px = np.rint(camera.apply_homography(np.linalg.inv(A), grid)).astype(int)
     inside = (px >= 0).all(1) & (px < (640, 480)).all(1)
     crop = np.zeros(size * size, bool)
     crop[inside] = mask[px[inside, 1], px[inside, 0]]
@@ -49,7 +49,7 @@ def test_points_are_the_object_points_under_the_cell_centres() -> None:
         grid = np.stack(np.meshgrid(np.arange(cells), np.arange(cells)), -1).reshape(-1, 2)[seen]
         centres = camera.cell_to_px(torch.from_numpy(grid).double(), size=128, cells=cells).numpy()
         # float64 throughout; only depth is float32
-        np.testing.assert_allclose(px, camera.apply(np.linalg.inv(crops.A_crop_img[0]), centres), atol=1e-8)
+        np.testing.assert_allclose(px, camera.apply_homography(np.linalg.inv(crops.A_crop_img[0]), centres), atol=1e-8)
         np.testing.assert_allclose(points[seen, 2], 0, atol=1e-4)
         assert seen.sum() > 0.5 * cells * cells
 

@@ -19,7 +19,7 @@ from pipeline.backbones.vit.source import Architecture
 from pipeline.backbones.vit.transformer import framed, position_grid
 from pipeline.errors import BadInput
 from pipeline.functional import camera
-from pipeline.functional.binning import log_binned
+from pipeline.functional.binning import log_bin
 from pipeline.items.features import CLASS_TOKEN_LAYER, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
@@ -203,7 +203,7 @@ def test_binned_layers_hold_the_bins_of_the_plain_ones(folder: Path) -> None:
     spec = extractor(folder, binned=[1])
     maps = spec.load(CPU)(crops, [0, 1])
     assert torch.equal(maps[0], plain[0])
-    assert_close(maps[1], log_binned(plain[1], hierarchy=2))
+    assert_close(maps[1], log_bin(plain[1], hierarchy=2))
     assert spec.feature_shape(1) == (17 * WIDTH, 8, 8) == tuple(maps[1].shape[1:])
     assert extractor(folder, binned=[1], hierarchy=1).feature_shape(1) == (9 * WIDTH, 8, 8)
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.functional.camera import apply, project, square_crop
+from pipeline.functional.camera import apply_homography, project, square_crop
 from pipeline.functional.rigid import rigid, transform
 from pipeline.stages.lift import lift
 
@@ -21,16 +21,18 @@ def _depth() -> np.ndarray:
 def test_points_project_back_onto_their_pixels_whatever_the_depth():
     px = np.random.default_rng(0).uniform(20, 100, (50, 2))
     points = lift(px, A, _depth(), K, T)
-    assert np.allclose(apply(A, project(K, transform(T, points))), px, atol=1e-9)
+    assert np.allclose(apply_homography(A, project(K, transform(T, points))), px, atol=1e-9)
 
 
 def test_known_plane_gives_known_points():
-    points_cam = transform(T, lift(apply(A, np.array([[63.5, 47.5], [63.4, 47.5], [64.5, 47.5]])), A, _depth(), K, T))
+    points_cam = transform(
+        T, lift(apply_homography(A, np.array([[63.5, 47.5], [63.4, 47.5], [64.5, 47.5]])), A, _depth(), K, T)
+    )
     assert np.allclose(points_cam, [[0, 0, 650], [-0.12, 0, 600], [1.3, 0, 650]], atol=1e-9)
 
 
 def test_background_is_nan():
-    points = lift(apply(A, np.array([[50.0, 9.4], [50.0, 9.6]])), A, _depth(), K, T)
+    points = lift(apply_homography(A, np.array([[50.0, 9.4], [50.0, 9.6]])), A, _depth(), K, T)
     assert np.isnan(points[0]).all()
     assert np.isfinite(points[1]).all()
 
@@ -41,4 +43,4 @@ def test_no_points_give_no_points():
 
 def test_point_outside_the_map_is_an_error_that_names_it():
     with pytest.raises(ValueError, match=r"template point \(-2.0, 40.0\) lies outside the 128 x 96 px depth map"):
-        lift(apply(A, np.array([[50.0, 40.0], [-2.0, 40.0]])), A, _depth(), K, T)
+        lift(apply_homography(A, np.array([[50.0, 40.0], [-2.0, 40.0]])), A, _depth(), K, T)

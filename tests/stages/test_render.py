@@ -13,7 +13,7 @@ import yaml
 from pipeline.errors import BadInput
 from pipeline.functional.camera import project, unproject
 from pipeline.functional.rigid import inverse, look_at, transform
-from pipeline.functional.viewpoints import unit_sphere
+from pipeline.functional.viewpoints import icosphere_mesh
 from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import Mesh
 from pipeline.spec import build
@@ -28,7 +28,7 @@ both = pytest.mark.parametrize("renderer", [Raycast, pytest.param(Pyrender, mark
 
 
 def ball(radius_mm: float, centre=(0.0, 0.0, 0.0), level: int = 3) -> Mesh:
-    points, faces = unit_sphere(level)
+    points, faces = icosphere_mesh(level)
     return Mesh(points * radius_mm + np.array(centre), faces)
 
 

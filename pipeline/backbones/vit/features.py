@@ -28,7 +28,7 @@ from pipeline.backbones.stable_diffusion.features import network_image
 from pipeline.backbones.vit.source import Architecture, TransformersFolder, find
 from pipeline.backbones.vit.transformer import Facet, block_tokens, embedded, framed, standardised
 from pipeline.errors import BadInput
-from pipeline.functional.binning import bin_count, log_binned
+from pipeline.functional.binning import bin_count, log_bin
 from pipeline.io.checkpoints import tensor_shapes
 from pipeline.io.digests import files_digest
 from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
@@ -167,7 +167,7 @@ class VitBackbone:
     def _map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
         side = 1 if layer == CLASS_TOKEN_LAYER else self.spec.input_size // self.spec.stride_px
         maps = tokens.transpose(1, 2).unflatten(2, (side, side))
-        return log_binned(maps, hierarchy=self.spec.hierarchy) if layer in self.spec.binned else maps
+        return log_bin(maps, hierarchy=self.spec.hierarchy) if layer in self.spec.binned else maps
 
 
 def _heads(spec: VitFeatures) -> Sequence[int]:

@@ -379,9 +379,9 @@ def _joined(path: Path, parts: Sequence[Mesh]) -> Mesh:
 
 
 def _grey(part: Mesh) -> UInt8[np.ndarray, "v 3"]:
-    from pipeline.functional.shading import PLAIN
+    from pipeline.functional.shading import DEFAULT_GREY
 
-    return np.full((len(part.vertices), 3), PLAIN, dtype=np.uint8)
+    return np.full((len(part.vertices), 3), DEFAULT_GREY, dtype=np.uint8)
 
 
 def _palette(part: Mesh) -> Mesh:

@@ -14,7 +14,7 @@ from pipeline.functional.camera import grid_xy
 from pipeline.functional.epipolar import epipolar_inliers
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import foreground
-from pipeline.functional.similarity import mutual_nearest, unit
+from pipeline.functional.similarity import l2_normalize, mutual_nearest
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
 from pipeline.stages.cluster import Side
@@ -50,7 +50,7 @@ class KMeans(Spec):
         cells = foreground(mask)
         if len(cells) == 0:
             raise NoPose("cluster", f"{name} mask has no cell")
-        points = unit(features.float().flatten(1).T[cells])
+        points = l2_normalize(features.float().flatten(1).T[cells])
         of_cell, centre = kmeans(points, count=self.count, seed=self.seed, iterations=self.iterations)
         label = torch.full_like(mask, -1, dtype=torch.int64)
         label.view(-1)[cells] = of_cell
@@ -58,7 +58,7 @@ class KMeans(Spec):
 
     def paired(self, query: Side, template: Side) -> Clusters:
         """The sides' labels, the clusters that correspond, and what was clamped or skipped."""
-        pairs = mutual_nearest(unit(query.centre) @ unit(template.centre).T)
+        pairs = mutual_nearest(l2_normalize(query.centre) @ l2_normalize(template.centre).T)
         notes = [
             f"{name}: {len(side.centre)} of {self.count} clusters"
             for name, side in (("query", query), ("template", template))

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import torch
 
 from pipeline.errors import NoPose
-from pipeline.functional.similarity import best_per_group, nearest_of_label, unit
+from pipeline.functional.similarity import best_per_group, l2_normalize, nearest_with_same_label
 from pipeline.functional.subpixel import neighbourhood_shift
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences
@@ -38,13 +38,13 @@ class Cosine(Spec):
         template_cell, template_pair = cells_in_pairs(clusters.template_label, clusters.pairs[:, 1])
         if len(query_cell) == 0 or len(template_cell) == 0:
             raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
-        query = unit(pair.query.float().movedim(0, -1).flatten(0, 1)[query_cell])
-        template = unit(pair.template.float().movedim(0, -1)).contiguous()
+        query = l2_normalize(pair.query.float().movedim(0, -1).flatten(0, 1)[query_cell])
+        template = l2_normalize(pair.template.float().movedim(0, -1)).contiguous()
         inside = template.flatten(0, 1).index_select(0, template_cell)
-        similarity, nearest = nearest_of_label(query, query_pair, inside, template_pair)
+        similarity, nearest = nearest_with_same_label(query, query_pair, inside, template_pair)
         candidate = similarity > 0
         if self.mutual:
-            _, back = nearest_of_label(inside, template_pair, query, query_pair)
+            _, back = nearest_with_same_label(inside, template_pair, query, query_pair)
             candidate &= back[nearest] == torch.arange(len(query), device=query.device)
         limit = self.per_cluster if len(clusters.pairs) > 1 else len(query)
         kept = best_per_group(similarity, query_pair, candidate, count=limit)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional.camera import grid_xy
-from pipeline.functional.similarity import nearest_of_label, unit
+from pipeline.functional.similarity import l2_normalize, nearest_with_same_label
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences
 from pipeline.spec import Positive, Spec, spec
@@ -47,7 +47,7 @@ class Cyclic(Spec):
         back = self._nearest(template, template_pair, query, query_pair)
         xy = grid_xy(query_cell, width=pair.query.shape[-1]).float()
         off_cells = torch.linalg.vector_norm(xy - xy[back[there]], dim=1)
-        similarity = (unit(query) * unit(template[there])).sum(1)
+        similarity = (l2_normalize(query) * l2_normalize(template[there])).sum(1)
         kept = self._best(off_cells, similarity, query_pair, candidate=torch.isin(query_pair, template_pair))
         if len(kept) == 0:
             raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
@@ -63,11 +63,11 @@ class Cyclic(Spec):
     ) -> Int[Tensor, " m"]:
         """Index of the row of b nearest to each row of a among those of its label; 0 where there is none."""
         if self.metric == "cosine":
-            return nearest_of_label(unit(a), a_label, unit(b), b_label)[1]
+            return nearest_with_same_label(l2_normalize(a), a_label, l2_normalize(b), b_label)[1]
         # |a - b|^2 = |a|^2 - 2 (a.b - |b|^2 / 2); one more channel: largest product = least distance
         a_one = torch.cat([a, torch.ones_like(a[:, :1])], dim=1)
         b_half = torch.cat([b, -(b * b).sum(1, keepdim=True) / 2], dim=1)
-        return nearest_of_label(a_one, a_label, b_half, b_label)[1]
+        return nearest_with_same_label(a_one, a_label, b_half, b_label)[1]
 
     def _best(
         self,

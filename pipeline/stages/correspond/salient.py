@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional.kmeans import kmeans
-from pipeline.functional.similarity import nearest_of_label, unit
+from pipeline.functional.similarity import l2_normalize, nearest_with_same_label
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences
 from pipeline.spec import Fraction, NonNegative, Positive, Spec, spec
@@ -40,10 +40,10 @@ class Salient(Spec):
         query_saliency, template_saliency = (_flat(s) for s in (pair.query_saliency, pair.template_saliency))
         query_cell, query_pair = self._salient(clusters.query_label, clusters.pairs[:, 0], query_saliency)
         template_cell, template_pair = self._salient(clusters.template_label, clusters.pairs[:, 1], template_saliency)
-        query = unit(pair.query.float().flatten(1).T[query_cell])
-        template = unit(pair.template.float().flatten(1).T[template_cell])
-        similarity, nearest = nearest_of_label(query, query_pair, template, template_pair)
-        _, back = nearest_of_label(template, template_pair, query, query_pair)
+        query = l2_normalize(pair.query.float().flatten(1).T[query_cell])
+        template = l2_normalize(pair.template.float().flatten(1).T[template_cell])
+        similarity, nearest = nearest_with_same_label(query, query_pair, template, template_pair)
+        _, back = nearest_with_same_label(template, template_pair, query, query_pair)
         buddy = ((back[nearest] == torch.arange(len(query), device=query.device)) & (similarity > 0)).nonzero()[:, 0]
         if not len(buddy):
             raise NoPose("correspond", f"no mutual neighbours among {len(query)} and {len(template)} salient cells")

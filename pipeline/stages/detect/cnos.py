@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.functional.boxes import not_suppressed
-from pipeline.functional.descriptors import mean_of_best
+from pipeline.functional.boxes import non_maximum_suppression
+from pipeline.functional.descriptors import mean_top_cosine
 from pipeline.items.features import CLASS_TOKEN_LAYER
 from pipeline.items.views import Detection, Proposal, Target
 from pipeline.spec import Fraction, Positive, Spec, spec
@@ -75,7 +75,7 @@ class Cnos(Spec):
         left = np.zeros(len(proposals), bool)
         for obj_id in {target.obj_id for target in targets}:
             mine = np.flatnonzero((assigned.obj_id == obj_id) & (assigned.score > self.min_score))
-            left[mine] = not_suppressed(boxes[mine], assigned.score[mine], max_iou=self.nms_iou)
+            left[mine] = non_maximum_suppression(boxes[mine], assigned.score[mine], max_iou=self.nms_iou)
         best_first = np.argsort(-assigned.score, kind="stable").tolist()
         return [i for i in best_first if left[i]][: self.max_per_image]
 
@@ -108,6 +108,6 @@ def _assigned(
     described: Float[Tensor, "p c"], templates: Mapping[int, Float[Tensor, "n c"]], *, best: int
 ) -> _Assigned:
     objects = sorted(templates)
-    scores = torch.stack([mean_of_best(described, templates[obj_id], best=best) for obj_id in objects], dim=1)
+    scores = torch.stack([mean_top_cosine(described, templates[obj_id], best=best) for obj_id in objects], dim=1)
     found = scores.max(dim=1)
     return _Assigned(np.array(objects)[found.indices.cpu().numpy()], found.values.double().cpu().numpy())

@@ -91,7 +91,7 @@ def cell_points(crops: Crops, i: int, *, cells: int) -> tuple[Float[np.ndarray, 
     depth_mm, size = crops.geometry.depth_mm[i], crops.mask.shape[-1]
     grid = np.stack(np.meshgrid(np.arange(cells), np.arange(cells)), axis=-1).reshape(-1, 2)
     px_crop = camera.cell_to_px(torch.from_numpy(grid).double(), size=size, cells=cells).numpy()
-    px_img = camera.apply(np.linalg.inv(crops.A_crop_img[i]), px_crop)
+    px_img = camera.apply_homography(np.linalg.inv(crops.A_crop_img[i]), px_crop)
     depth = nearest(depth_mm, px_img, outside=0.0)
     seen = nearest(crops.mask[i], px_crop, outside=False) & (depth > 0)
     points_cam = camera.unproject(crops.geometry.K[i], px_img, depth)

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, PlainValidator
 
 from pipeline.backbones.batching import Footprint, Sized, maps_bytes
 from pipeline.errors import BadInput
-from pipeline.functional.maps import side_by_side
+from pipeline.functional.maps import concatenate_normalized
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Fraction, Runtime, Spec, spec
@@ -144,7 +144,9 @@ class FusionBackbone:
         partner = {layer: self.spec.partner(layer) for layer in layers}
         first = self.first(crops, tuple(partner))
         second = self.second(crops, tuple(sorted(set(partner.values()))))
-        return {k: side_by_side(first[k], second[other], alpha=self.spec.alpha) for k, other in partner.items()}
+        return {
+            k: concatenate_normalized(first[k], second[other], alpha=self.spec.alpha) for k, other in partner.items()
+        }
 
 
 def _sized(member: Extractor, name: str) -> Sized:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
 from pipeline.backbones.grid import CELLS, cells_of
-from pipeline.functional.gradients import cell_means, oriented_energy, smoothed, with_context
+from pipeline.functional.gradients import append_neighbours, cell_means, oriented_energy, smooth_histograms
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, Spec, spec
@@ -81,4 +81,6 @@ class HogBackbone:
         return {k: self._map(cell_means(finest, cells=n)) for k, n in cells.items()}
 
     def _map(self, histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n c h w"]:
-        return with_context(smoothed(histograms), distance=self.spec.context_cells, contrast=self.spec.contrast)
+        return append_neighbours(
+            smooth_histograms(histograms), distance=self.spec.context_cells, contrast=self.spec.contrast
+        )

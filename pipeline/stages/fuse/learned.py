@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
-from pipeline.functional.gradients import EDGES, with_edges
+from pipeline.functional.gradients import EDGES, append_edges
 from pipeline.io.digests import file_digest
 from pipeline.items.features import FusedPair
 from pipeline.spec import PositiveFloat, Spec, spec
@@ -74,7 +74,7 @@ class Learned(Spec):
         with torch.no_grad():
             described = _head(features[self.layers[0]].device)(maps)
             if EDGES in maps:
-                described = with_edges(described, maps[EDGES], weight=self.edges)
+                described = append_edges(described, maps[EDGES], weight=self.edges)
         return described[0]
 
 

@@ -13,7 +13,7 @@ from pipeline.fits import Fitted, fitted_to, foreground_cells
 from pipeline.fits.projection import Projection
 from pipeline.fits.vocabulary import Vocabulary
 from pipeline.functional.masks import cell_mask
-from pipeline.functional.pca import projected
+from pipeline.functional.pca import project_onto_axes
 from pipeline.items.matches import TemplateMatch
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
 from pipeline.stages.match import ranked
@@ -77,7 +77,7 @@ class Words(Spec):
         inside = cell_mask(query_mask, cells=query.shape[-1])
         if not inside.any():
             raise NoPose("match", "query mask is empty, needs 1 pixel")
-        points = projected(query.float().movedim(0, -1)[inside], fitted["mean"], fitted["axes"])
+        points = project_onto_axes(query.float().movedim(0, -1)[inside], fitted["mean"], fitted["axes"])
         if not bool(torch.isfinite(points).all()):
             raise NoPose("match", "features are not finite")
         return ranked(fitted["templates"] @ self.fit.vector(points, fitted), top_k=self.top_k)

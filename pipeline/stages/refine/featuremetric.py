@@ -10,7 +10,14 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.functional.camera import cell_affine
-from pipeline.functional.featuremetric import Robust, descend, level, normal_equations, robust_scale, unit
+from pipeline.functional.featuremetric import (
+    RobustLoss,
+    build_level,
+    descend,
+    l2_normalize,
+    normal_equations,
+    robust_scale,
+)
 from pipeline.items.features import FusedPair
 from pipeline.spec import NonNegative, NonNegativeFloat, Positive, PositiveFloat, Spec, spec
 
@@ -64,7 +71,7 @@ class Featuremetric(Spec):
         K_cell = cell_affine(size=crop_size, cells=query_mask.shape[-1]) @ K_crop
         T = T_cam_obj
         for sigma in self.sigmas_cells:
-            surface, field = level(
+            surface, field = build_level(
                 query,
                 query_mask,
                 template,
@@ -74,15 +81,15 @@ class Featuremetric(Spec):
                 sigma_cells=sigma,
                 directions=self.normalise,
             )
-            robust = Robust(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T))
+            robust = RobustLoss(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T))
             T = descend(surface, field, K_cell, T, robust, iterations=self.iterations)
-        robust = Robust(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T_cam_obj))
+        robust = RobustLoss(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T_cam_obj))
         before, after = (normal_equations(surface, field, K_cell, pose, robust)[0] for pose in (T_cam_obj, T))
         return T if after < before else T_cam_obj
 
     def _descriptors(self, features: Float[Tensor, "d h w"]) -> Float32[np.ndarray, "h w d"]:
         maps = np.ascontiguousarray(features.float().movedim(0, -1).cpu().numpy())
-        return unit(maps) if self.normalise else maps
+        return l2_normalize(maps) if self.normalise else maps
 
     def _chosen(self, points_obj: Float[np.ndarray, "m 3"]) -> np.ndarray:
         """Rows with a point, in order; no more than ``max_points``."""

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, UInt8
 from pipeline.errors import BadInput
 from pipeline.functional.camera import resize_affine
 from pipeline.functional.rigid import inverse
-from pipeline.functional.shading import PLAIN, corner_normals, lit
+from pipeline.functional.shading import DEFAULT_GREY, corner_normals, shade
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
 from pipeline.stages.render.cameras import Studio, bounding_sphere
@@ -68,7 +68,7 @@ class Pyrender(Studio):
         px = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1)
         A = T_cam_obj[:3, :3].T @ np.linalg.inv(K)
         rays_obj = px @ A[:, :2].T + A[:, 2]
-        colour = lit(255 * albedo, 2 * normal - 1, rays_obj, ambient=self.ambient, diffuse=self.diffuse)
+        colour = shade(255 * albedo, 2 * normal - 1, rays_obj, ambient=self.ambient, diffuse=self.diffuse)
         tiles = (size_hw[0], s, size_hw[1], s, -1)
         return (colour * covered).reshape(tiles).sum(axis=(1, 3)), covered.reshape(tiles).sum(axis=(1, 3))
 
@@ -140,7 +140,7 @@ def _skin(gl: Any, mesh: Mesh, vertices: Float[np.ndarray, "v 3"]) -> Any:
         opaque = np.dstack([mesh.texture, np.full(mesh.texture.shape[:2], 255, dtype=np.uint8)])
         material = _two_sided(gl, baseColorTexture=gl.Texture(source=opaque, source_channels="RGBA"))
         return gl.Primitive(vertices, indices=mesh.faces, texcoord_0=mesh.uv, material=material)
-    plain = np.full((len(vertices), 3), PLAIN)
+    plain = np.full((len(vertices), 3), DEFAULT_GREY)
     colours = (plain if mesh.colours is None else mesh.colours) / 255
     opaque = np.concatenate([colours, np.ones((len(vertices), 1))], axis=-1).astype(np.float32)
     return gl.Primitive(vertices, indices=mesh.faces, color_0=opaque, material=_two_sided(gl))

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from pipeline.errors import BadInput
 from pipeline.functional.camera import project
 from pipeline.functional.rigid import transform
-from pipeline.functional.shading import PLAIN, corner_normals, lit, mip_levels, texel_density, texture_colour
+from pipeline.functional.shading import DEFAULT_GREY, corner_normals, mip_levels, shade, texel_density, texture_colour
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
 from pipeline.stages.render.cameras import Studio, bounding_sphere, face_vertices, subpixels
@@ -70,7 +70,7 @@ class Raycast(Studio):
     def _colour(self, surface: _Surface, hits: Hits, footprint: float) -> Float32[np.ndarray, "m 3"]:
         """Colour of each hit under a light at the camera, seen through rays as wide as ``footprint`` at 1 mm."""
         albedo, normal = surface.at(hits, footprint_mm=hits.depth_mm * footprint)
-        return lit(albedo, normal, hits.direction, ambient=self.ambient, diffuse=self.diffuse)
+        return shade(albedo, normal, hits.direction, ambient=self.ambient, diffuse=self.diffuse)
 
 
 def render_depth(
@@ -179,7 +179,7 @@ class _Surface:
         elif mesh.colours is not None:
             skin = mesh.colours[mesh.faces]
         else:
-            skin = np.full((len(mesh.faces), 3, 3), PLAIN)
+            skin = np.full((len(mesh.faces), 3, 3), DEFAULT_GREY)
         corners = np.concatenate([normals, skin], axis=-1).astype(np.float32)
         self.corners = tuple(np.ascontiguousarray(corners[:, k]) for k in range(3))
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 
 from pipeline.errors import NoPose
-from pipeline.functional.pnp import polished, reprojection_error_px
+from pipeline.functional.pnp import polish, reprojection_error_px
 from pipeline.items.poses import PoseSolution
 from pipeline.spec import Variant
 
@@ -66,7 +66,7 @@ def solution(
     if T_cam_obj is None:
         raise NoPose("solve", f"no pose brings {min_inliers} of {len(points)} points within {threshold_px:g} px")
     if refine:
-        T_cam_obj = polished(points, px, K, T_cam_obj, threshold_px=threshold_px)
+        T_cam_obj = polish(points, px, K, T_cam_obj, threshold_px=threshold_px)
     error = reprojection_error_px(points, px, K, T_cam_obj)
     near = error < threshold_px
     if near.sum() < min_inliers:

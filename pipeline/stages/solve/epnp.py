@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.functional.pnp import pose_of
+from pipeline.functional.pnp import pose_from_opencv
 from pipeline.items.poses import PoseSolution
 from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
 from pipeline.stages.solve import Confidence, Plane, PnpPoints, solution, usable
@@ -69,4 +69,4 @@ class Epnp(Spec):
             )
         except cv2.error:  # sets without extent
             return None
-        return pose_of(rvec, tvec) if found else None
+        return pose_from_opencv(rvec, tvec) if found else None

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pipeline.backbones.sam import SamWeights, find
 from pipeline.bop.masks import encode
-from pipeline.functional.boxes import area, not_suppressed
+from pipeline.functional.boxes import area, non_maximum_suppression
 from pipeline.functional.camera import mask_bbox
 from pipeline.io.checkpoints import tensor_shapes
 from pipeline.io.digests import files_digest
@@ -102,7 +102,7 @@ class SamProposing:
         ]
         boxes = np.array([p.bbox_xyxy for p in found]).reshape(-1, 4)
         score = np.array([p.confidence for p in found])
-        kept = not_suppressed(boxes, score, max_iou=self.spec.nms_iou)
+        kept = non_maximum_suppression(boxes, score, max_iou=self.spec.nms_iou)
         kept &= area(boxes) > self.spec.min_box_size**2 * size_hw[0] * size_hw[1]
         return [found[i] for i in np.argsort(-score, kind="stable") if kept[i]]
 
