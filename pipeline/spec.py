@@ -1,6 +1,6 @@
-"""Specs say what is computed and enter every key; Runtime says how and enters none.
+"""Specs: typed parameters of a stage, hashed into cache keys. ``Runtime`` says how to compute and is not hashed.
 
-A variant of a stage is a frozen, type-checked dataclass whose fields are its parameters::
+A stage variant is a frozen, type-checked dataclass whose fields are its parameters::
 
     @spec
     class Cosine(Spec):
@@ -8,14 +8,14 @@ A variant of a stage is a frozen, type-checked dataclass whose fields are its pa
         version: ClassVar[int] = 1
         layer: int = 2
 
-``kind`` is ``<stage>.<file name>``; raise ``version`` whenever the same fields give other results.
+``kind`` is ``<stage>.<file name>``. Raise ``version`` whenever a code change alters results for the same fields.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
@@ -23,14 +23,15 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, datacla
 
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
+from pydantic_core import ErrorDetails
 
 from pipeline.errors import BadInput
 
 T = TypeVar("T")
 
-MOST = 2**31 - 1  # of a count or a seed: what C code below numpy, torch and OpenCV takes
-Positive = Annotated[int, Field(ge=1, le=MOST)]
-NonNegative = Annotated[int, Field(ge=0, le=MOST)]
+MAX_INT = 2**31 - 1  # counts and seeds reach C code in numpy, torch and OpenCV that takes 32-bit integers
+Positive = Annotated[int, Field(ge=1, le=MAX_INT)]
+NonNegative = Annotated[int, Field(ge=0, le=MAX_INT)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -38,133 +39,163 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 def spec(cls: type[T]) -> type[T]:
-    """Frozen, keyword-only dataclass whose fields are checked strictly (no "1" for 1, no True for 1)."""
+    """Decorator: a frozen, keyword-only dataclass with strict type checks (neither "1" nor True passes for 1)."""
     config = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
     return checked_dataclass(frozen=True, kw_only=True, config=config)(cls)  # type: ignore[return-value]
 
 
 class Variant(Protocol):
-    """What the cached graph asks of any stage: a name, and all that its results depend on but its inputs."""
+    """Any stage, as the cache sees it: a name and a recipe."""
 
     kind: ClassVar[str]
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe."""
+        """See ``Spec.recipe``."""
         ...
 
 
 class Spec:
-    """Base of every spec. See the module's text."""
+    """Base class of all specs; see the module docstring."""
 
     kind: ClassVar[str]
     version: ClassVar[int] = 1
 
     def recipe(self) -> dict[str, Any]:
-        """Everything the result depends on but the inputs, as JSON-able values.
+        """Everything except the inputs that the result depends on, as JSON-able values.
 
-        A field that is a location on disk is replaced here, by its owner, with the digest of what lies there.
+        Specs with a path among their fields override this to hash the file's contents instead of its location.
         """
         return {"kind": self.kind, "version": self.version} | {
-            f.name: _plain(getattr(self, f.name))
+            f.name: _to_jsonable(getattr(self, f.name))
             for f in fields(self)  # type: ignore[arg-type]
         }
 
 
-def _plain(value: Any) -> Any:
+def _to_jsonable(value: Any) -> Any:
     if isinstance(value, Spec):
         return value.recipe()
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+        return {f.name: _to_jsonable(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, (tuple, list)):
-        return [_plain(v) for v in value]
+        return [_to_jsonable(v) for v in value]
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _to_jsonable(v) for k, v in value.items()}
     return value
 
 
 def canonical(value: Any) -> str:
-    """The one text of a JSON-able value: sorted keys, no spaces, no NaN. 1, 1.0, True and "1" differ."""
+    """Canonical JSON: sorted keys, no spaces. 1, 1.0, True and "1" differ. Raises ValueError for NaN and infinity."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
 def digest(value: Any) -> str:
-    """sha256 (hex) of the canonical text of a JSON-able value."""
+    """sha256 (hex) of a value's canonical JSON."""
     return sha256(canonical(value).encode()).hexdigest()
 
 
 def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
-    """The spec ``cls`` from configuration values (lists become tuples).
+    """Build the spec ``cls`` from configuration values; lists become tuples.
 
-    Raises BadInput naming ``where.field``, what was found and what is needed; several mistakes give the first.
+    Raises BadInput for the first invalid field, which it names ``where.field``.
     """
     try:
-        return cls(**{k: _tuples(v) for k, v in values.items()})
+        return cls(**lists_to_tuples(values))
     except ValidationError as error:
         first = error.errors()[0]
-        field = ".".join([where, *(str(p) for p in first["loc"])])
-        if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = ", ".join(f.name for f in fields(cls))  # type: ignore[arg-type]
-            raise BadInput(field, found="an unknown field", needed=f"one of: {known}") from None
-        if first["type"] in ("too_long", "too_short"):
-            least_or_most = "at most" if first["type"] == "too_long" else "at least"
-            count = first["ctx"].get("max_length", first["ctx"].get("min_length"))
-            needed = f"{least_or_most} {count} value{'' if count == 1 else 's'}"
-            raise BadInput(field, found=_shown(first["input"]), needed=needed) from None
-        if first["type"] == "missing" and isinstance(first["loc"][-1], int):  # the first value that a tuple lacks
-            field = ".".join([where, *(str(p) for p in first["loc"][:-1])])
-            raise BadInput(
-                field, found=_shown(first["input"]), needed="more values: its yaml in conf/ says which"
-            ) from None
-        message = first["msg"].removeprefix("Value error, ")
-        needed = message[0].lower() + message[1:].removeprefix("nput should be ")
-        needed = needed.removeprefix("i") if message.startswith("Input should be ") else needed
-        found = getattr(first["input"], "kind", None) or repr(first["input"])  # a whole spec would fill the screen
-        raise BadInput(field, found=found, needed=needed) from None
+        explain = _EXPLANATIONS.get(first["type"], _explain_value)
+        raise explain(first, where, cls) from None
 
 
-def _shown(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _tuples(value: Any) -> Any:
+def lists_to_tuples(value: Any) -> Any:
+    """The value with every list in it, however deeply nested, made a tuple."""
     if isinstance(value, (list, tuple)):
-        return tuple(_tuples(v) for v in value)
+        return tuple(lists_to_tuples(v) for v in value)
     if isinstance(value, Mapping):
-        return {k: _tuples(v) for k, v in value.items()}
+        return {k: lists_to_tuples(v) for k, v in value.items()}
     return value
+
+
+# --- pydantic's errors as BadInput ------------------------------------------------------------------------------------
+
+
+def _explain_value(error: ErrorDetails, where: str, cls: type) -> BadInput:
+    """Any error without an entry in ``_EXPLANATIONS``: pydantic's message already names what it needs."""
+    needed = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    found = getattr(error["input"], "kind", None) or repr(error["input"])  # the repr of a spec would fill the screen
+    return BadInput(_field(where, error["loc"]), found=found, needed=needed)
+
+
+def _explain_unknown(error: ErrorDetails, where: str, cls: type) -> BadInput:
+    known = ", ".join(f.name for f in fields(cls))
+    return BadInput(_field(where, error["loc"]), found="an unknown field", needed=f"one of: {known}")
+
+
+def _explain_missing(error: ErrorDetails, where: str, cls: type) -> BadInput:
+    """A missing field; or, where the location ends with an index, a tuple with too few values."""
+    *parent, last = error["loc"]
+    if isinstance(last, int):
+        needed = "more values: see its yaml in conf/"
+        return BadInput(_field(where, parent), found=list(error["input"]), needed=needed)
+    return BadInput(_field(where, error["loc"]), found="nothing", needed="a value")
+
+
+def _explain_too_long(error: ErrorDetails, where: str, cls: type) -> BadInput:
+    needed = f"at most {_count_values(error['ctx']['max_length'])}"
+    return BadInput(_field(where, error["loc"]), found=list(error["input"]), needed=needed)
+
+
+def _explain_too_short(error: ErrorDetails, where: str, cls: type) -> BadInput:
+    needed = f"at least {_count_values(error['ctx']['min_length'])}"
+    return BadInput(_field(where, error["loc"]), found=list(error["input"]), needed=needed)
+
+
+_EXPLANATIONS: dict[str, Callable[[ErrorDetails, str, type], BadInput]] = {
+    "unexpected_keyword_argument": _explain_unknown,
+    "missing": _explain_missing,
+    "too_long": _explain_too_long,
+    "too_short": _explain_too_short,
+}
+
+
+def _field(where: str, loc: Iterable[int | str]) -> str:
+    return ".".join([where, *(str(part) for part in loc)])
+
+
+def _count_values(count: int) -> str:
+    return f"{count} value{'' if count == 1 else 's'}"
 
 
 @spec
 class Runtime:
-    """How to compute: never part of a key, never a reason for other results.
+    """How to compute. Never part of a key, because it must not change results.
 
-    ``device`` is "auto", "cpu", "cuda" or "cuda:N"; ``batch`` the images per backbone pass, 0 = sized to memory;
-    ``max_vram`` and ``max_memory`` what the run may take of the device's memory and of the machine's, such as 8GiB,
-    None = whatever is free.
+    ``device``: "auto", "cpu", "cuda" or "cuda:N". ``batch``: images per backbone pass, 0 = as many as fit in memory.
+    ``max_vram`` and ``max_memory``: the most GPU memory and main memory the run may use, such as 8GiB, None = all
+    that is free.
     """
 
     device: str = "auto"
     batch: NonNegative = 0
-    max_vram: Any = None  # what is no size is refused where it is read
+    max_vram: Any = None  # checked by vram_bytes and memory_bytes
     max_memory: Any = None
     progress: bool = True
 
     @property
     def vram_bytes(self) -> int | None:
-        """``max_vram`` in bytes. Raises BadInput for what is no size."""
-        return _size_bytes(self.max_vram, "runtime.max_vram")
+        """``max_vram`` in bytes. Raises BadInput if it is not a size."""
+        return _parse_size(self.max_vram, "runtime.max_vram")
 
     @property
     def memory_bytes(self) -> int | None:
-        """``max_memory`` in bytes. Raises BadInput for what is no size."""
-        return _size_bytes(self.max_memory, "runtime.max_memory")
+        """``max_memory`` in bytes. Raises BadInput if it is not a size."""
+        return _parse_size(self.max_memory, "runtime.max_memory")
 
     def workers(self, run: Any, *, threads: int) -> AbstractContextManager[Any]:
-        """Who does a run's work: None for the process that asks. ``threads`` as in the configuration, 0 for all."""
+        """Worker processes for a run; None means this process computes everything. ``threads`` per process, 0 = all."""
         return nullcontext()
 
     def torch_device(self) -> str:
-        """Torch's name of the device. Raises BadInput when CUDA is asked for and absent."""
+        """The torch device name, with "auto" resolved. Raises BadInput if CUDA is requested but not available."""
         import torch
 
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
@@ -172,7 +203,7 @@ class Runtime:
         if self.device == "auto":
             return "cuda" if torch.cuda.is_available() else "cpu"
         if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise BadInput("runtime.device", found=repr(self.device), needed="a CUDA device, and torch sees none")
+            raise BadInput("runtime.device", found=repr(self.device), needed="a CUDA device that torch can use")
         return self.device
 
 
@@ -180,13 +211,13 @@ _UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12,
           "KIB": 1 << 10, "MIB": 1 << 20, "GIB": 1 << 30, "TIB": 1 << 40}  # fmt: skip
 
 
-def _size_bytes(size: object, field: str) -> int | None:
+def _parse_size(size: object, field: str) -> int | None:
     if size is None:
         return None
-    found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?([KMGT]i?B|B)", str(size), re.IGNORECASE)
-    nbytes = 0 if found is None else int(float(found[1]) * _UNITS[found[2].upper()])
+    match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?([KMGT]i?B|B)", str(size), re.IGNORECASE)
+    nbytes = 0 if match is None else int(float(match[1]) * _UNITS[match[2].upper()])
     if nbytes < 1:
-        raise BadInput(field, found=repr(size), needed="a size with its unit, such as 8GiB or 500MB, or null")
+        raise BadInput(field, found=repr(size), needed="a size with a unit, such as 8GiB or 500MB, or null")
     return nbytes
 
 

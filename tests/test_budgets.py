@@ -97,7 +97,7 @@ def test_what_is_no_size_is_refused_in_one_line(dzop, field, size):
     ran = dzop(f"runtime.{field}={size}", "step=detect")
     assert ran.status == 1
     assert ran.err.strip().startswith(f"error: runtime.{field}: found ")
-    assert ran.err.strip().endswith("needs a size with its unit, such as 8GiB or 500MB, or null")
+    assert ran.err.strip().endswith("needs a size with a unit, such as 8GiB or 500MB, or null")
     assert len(ran.err.strip().splitlines()) == 1
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from pipeline.spec import _tuples, build
+from pipeline.spec import build, lists_to_tuples
 
 CONF = Path(__file__).parents[1] / "conf"
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
@@ -36,7 +36,7 @@ def test_a_yaml_lists_every_field_of_its_class_with_the_default(path: Path):
         if field.default is MISSING and field.default_factory is MISSING:
             continue  # a variant of another stage, which no class here may name
         default = field.default if field.default is not MISSING else field.default_factory()
-        assert (_tuples(values[field.name]), field.name) == (default, field.name)
+        assert (lists_to_tuples(values[field.name]), field.name) == (default, field.name)
 
 
 @pytest.mark.parametrize("path", VARIANTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
