@@ -17,7 +17,7 @@ from pipeline.errors import DzopError
 from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
 from pipeline.metrics.recall import instance_recalls
-from pipeline.report.rows import Row, read_rows
+from pipeline.report.run_records import RunRecord, read_run_records
 from pipeline.spec import digest
 
 TEST_SEED = 9041  # of synthetic.demo; training and validation objects have builders and seeds of their own
@@ -69,7 +69,7 @@ def benchmark(
         for (title, name), out in outs.items()
     }
     _run_all(choices, jobs=jobs)
-    rows = {run: max(read_rows(out), key=lambda row: row.at) for run, out in outs.items()}
+    rows = {run: max(read_run_records(out), key=lambda row: row.at) for run, out in outs.items()}
     return "\n\n".join(_table(title, {name: rows[title, name] for name in SYSTEMS}) for title in parts)
 
 
@@ -107,7 +107,7 @@ def _run_all(choices: Mapping[tuple[str, str], Sequence[str]], *, jobs: int) -> 
         signal.signal(signal.SIGINT, before)
 
 
-def _table(title: str, rows: Mapping[str, Row]) -> str:
+def _table(title: str, rows: Mapping[str, RunRecord]) -> str:
     """A row for each system: 95 % intervals over images in brackets, and by how much the first one leads."""
     recalls = [k for k, name in enumerate(RECALLS) if rows[OURS].metrics.get(name) is not None]
     heads = ["features", *TEMPLATES.values(), *(RECALLS[k] for k in recalls), "mean", f"lead of {OURS}"]
@@ -131,16 +131,16 @@ def _folder(name: str) -> str:
     return name.replace(",", "").replace(" ", "_")
 
 
-def _recalls(row: Row, which: Sequence[int]) -> np.ndarray:
+def _recalls(row: RunRecord, which: Sequence[int]) -> np.ndarray:
     return instance_recalls(_scores(row))[:, which]
 
 
-def _scores(row: Row) -> Scores:
+def _scores(row: RunRecord) -> Scores:
     assert row.scores is not None
     return row.scores
 
 
-def _bracketed(values: np.ndarray, row: Row) -> str:
+def _bracketed(values: np.ndarray, row: RunRecord) -> str:
     scores = _scores(row)
     found: Interval = mean_interval(values, image_index(scores.scene_id, scores.im_id))
     return f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]"

@@ -22,8 +22,8 @@ from pipeline.items.records import Answer, record_of
 from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, errors_record
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.report.gallery import Card, draw_card, pick_cases
-from pipeline.report.overlay import Drawn, draw_overlay, write_overlay
-from pipeline.report.rows import Case, Row, done_row, row_id, row_path, write_row
+from pipeline.report.overlay import DrawnPose, draw_overlay, write_overlay
+from pipeline.report.run_records import Case, RunRecord, finished_run_record, run_id, run_record_path, write_run_record
 from pipeline.report.scores import summary_of
 from pipeline.scoring import dataset_id
 
@@ -66,18 +66,18 @@ class Outputs:
         return self.folder / ("overlays" if self.scores or not annotated else "overlays-unchecked")
 
     @cached_property
-    def row_path(self) -> Path:
+    def run_record_path(self) -> Path:
         """The file of the run's row."""
-        return row_path(self.out, row_id(self.config))
+        return run_record_path(self.out, run_id(self.config))
 
     def finished(self) -> bool:
         """Whether an earlier run of the same configuration, on the same inputs, has left all its files."""
         row = self._row_before()
         return row is not None and (self.out / row.folder / row.csv).exists()
 
-    def _row_before(self) -> Row | None:
+    def _row_before(self) -> RunRecord | None:
         """The row that an earlier run of the same configuration on the same inputs has left, if it ended well."""
-        row = done_row(self.out, row_id(self.config))
+        row = finished_run_record(self.out, run_id(self.config))
         return row if row and self.scores and row.run == self.scores.ref.key else None
 
     def write_detections(self) -> Path:
@@ -174,7 +174,7 @@ class Outputs:
         ids, file = (answer.scene_id, answer.im_id, answer.obj_id), f"gallery/{_named(answer)}.jpg"
         return Case(file, *ids, None if errors is None else errors.relative_mssd, text)
 
-    def _drawn(self, shown: Sequence[tuple[Answer, PoseErrors | None]], *, gt_id: int | None = None) -> list[Drawn]:
+    def _drawn(self, shown: Sequence[tuple[Answer, PoseErrors | None]], *, gt_id: int | None = None) -> list[DrawnPose]:
         """Every estimate of an image and, where they are held against it, the ground truth of its targets.
 
         ``gt_id``: of this instance alone.
@@ -183,21 +183,21 @@ class Outputs:
         asked = {answer.obj_id for answer, _ in shown} if self.scores else set()
         truths = run.dataset.ground_truth(first.scene_id, first.im_id) if asked else []
         wanted = [gt for gt in truths if gt.obj_id in asked and gt_id in (None, gt.gt_id)]
-        drawn = [Drawn(run.model(gt.obj_id).mesh, gt.T_cam_obj, "truth") for gt in wanted]
+        drawn = [DrawnPose(run.model(gt.obj_id).mesh, gt.T_cam_obj, "truth") for gt in wanted]
         for answer, errors in shown:
             if isinstance(answer, PoseEstimate):
                 label = f"{answer.obj_id}: {answer.score:.2f}"
-                drawn.append(Drawn(run.model(answer.obj_id).mesh, answer.T_cam_obj, _role(errors), label))
+                drawn.append(DrawnPose(run.model(answer.obj_id).mesh, answer.T_cam_obj, _role(errors), label))
         return drawn
 
-    def write_row(self, answers: Sequence[Answer], judged: Judged, cases: Sequence[Case]) -> None:
+    def write_run_record(self, answers: Sequence[Answer], judged: Judged, cases: Sequence[Case]) -> None:
         """The row that reports read."""
         assert self.scores is not None
         run, scores = self.graph.run, judged.scored.scores
         metrics = summary_of(judged.scored, theta_max=self.theta_max)["metrics"]
         missing = Counter((a.stage, a.reason) for a in answers if isinstance(a, NoEstimate))
-        row = Row(
-            id=row_id(self.config),
+        row = RunRecord(
+            id=run_id(self.config),
             status="done",
             at=now(),
             method=self.name,
@@ -222,7 +222,7 @@ class Outputs:
         before = self._row_before()
         if before is not None:  # what was computed is what the first run computed
             row = replace(row, at=before.at, counts=before.counts, sweep=before.sweep)
-        print(f"row       {write_row(self.out, row)}")
+        print(f"row       {write_run_record(self.out, row)}")
 
 
 def now() -> str:

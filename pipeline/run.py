@@ -23,7 +23,7 @@ from pipeline.items.views import Target
 from pipeline.metrics.recall import THETAS
 from pipeline.outputs import KEY_DIGITS, Outputs, now
 from pipeline.progress import Progress, format_bytes
-from pipeline.report.rows import Row, done_row, read_rows, row_id, write_row
+from pipeline.report.run_records import RunRecord, finished_run_record, read_run_records, run_id, write_run_record
 from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
 from pipeline.route import Stages
@@ -198,7 +198,7 @@ def _estimate(graph: Graph, options: Options) -> None:
     scores = _scores(graph, options)
     outputs, theta_max = _outputs(graph, scores, options), options.evaluate.theta_max
     if options.resume and scores is not None and outputs.finished():
-        print(f"finished before: {outputs.row_path}")
+        print(f"finished before: {outputs.run_record_path}")
         return
     for doubt in (odd := graph.doubts())[:ROWS_SHOWN]:
         print(f"warning: {doubt}", flush=True)
@@ -211,7 +211,7 @@ def _estimate(graph: Graph, options: Options) -> None:
     print(outputs.places(overlays=options.overlays))
     if judged is not None:
         cases = outputs.draw_gallery(answers, judged, options.gallery)
-        outputs.write_row(answers, judged, cases)
+        outputs.write_run_record(answers, judged, cases)
 
 
 def _check_folder(out: Path) -> None:
@@ -323,10 +323,10 @@ def duration(seconds: float) -> str:
 
 def note_failure(out: str, config: Mapping[str, Any], overrides: Sequence[str], message: str) -> None:
     """Leave a row that says that a job failed and why, unless the same configuration has ended well before."""
-    id_ = row_id(config)
-    if done_row(Path(out), id_) is not None:
+    id_ = run_id(config)
+    if finished_run_record(Path(out), id_) is not None:
         return
-    row = Row(
+    row = RunRecord(
         id=id_,
         status="failed",
         at=now(),
@@ -337,12 +337,12 @@ def note_failure(out: str, config: Mapping[str, Any], overrides: Sequence[str], 
         overrides=tuple(overrides),
         sweep=str(config.get("sweep") or ""),
     )
-    write_row(Path(out), row)
+    write_run_record(Path(out), row)
 
 
 def make_report(out: str) -> None:
     """The report of all rows below ``out``. Raises BadInput where there is none."""
     from pipeline.report.page import write_report  # matplotlib, which no other step needs
 
-    made = write_report(read_rows(Path(out)), Path(out))
+    made = write_report(read_run_records(Path(out)), Path(out))
     print(made.summary)

@@ -48,7 +48,7 @@ Rows = list[tuple[int, ResultRow]]
 
 
 @dataclass(frozen=True, eq=False)
-class Scored:
+class ScoringResult:
     """Errors of each estimate that counts against each instance of its object, and the instances found."""
 
     errors: tuple[PoseErrors, ...]
@@ -95,7 +95,9 @@ class Scorer:
             return False
         return True
 
-    def score(self, rows: Sequence[ResultRow], *, progress: Callable[[int], None] = lambda images: None) -> Scored:
+    def score(
+        self, rows: Sequence[ResultRow], *, progress: Callable[[int], None] = lambda images: None
+    ) -> ScoringResult:
         """Errors and scores of ``rows``; ``PoseErrors.row`` is the index of an estimate in it."""
         estimates: defaultdict[tuple[int, int, int], list[int]] = defaultdict(list)
         for index, row in enumerate(rows):
@@ -109,7 +111,7 @@ class Scorer:
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # poses may be anywhere
                 found += [(target, self._find(view, target, rows, estimates)) for target in by_image[image]]
             progress(1)
-        return Scored(tuple(e for _, f in found for e in f.errors), self._scores(found), self.models)
+        return ScoringResult(tuple(e for _, f in found for e in f.errors), self._scores(found), self.models)
 
     def _find(
         self,

@@ -14,24 +14,24 @@ from command import heeds_ctrl_c
 
 from benchmarks import accuracy as benchmark
 from pipeline.items.scores import Scores
-from pipeline.report.rows import Row
+from pipeline.report.run_records import RunRecord
 
 
-def row(*, correct: bool) -> Row:
+def row(*, correct: bool) -> RunRecord:
     """Twelve instances in four images, all right or all wrong."""
     n = 12
     hit = np.full((n, 10), correct)
     scores = Scores(np.ones(n, int), np.arange(n) % 4, np.arange(n), np.zeros(n, int), np.ones(n), hit, hit, None, "")
     metrics = {"AR_MSSD": float(correct), "AR_MSPD": float(correct), "AR_VSD": None}
     metrics |= {"Acc15_geodesic": 0.25, "template_error_geodesic_deg": 12.34}
-    return Row("0", "done", "2026", "m", {}, {}, metrics=metrics, scores=scores)
+    return RunRecord("0", "done", "2026", "m", {}, {}, metrics=metrics, scores=scores)
 
 
 def stand_in(monkeypatch, row_of) -> list[list[str]]:
     """Rows without runs; the choices that would have been run, in their order."""
     asked: list[list[str]] = []
     monkeypatch.setattr(benchmark, "_run_all", lambda choices, jobs: asked.extend(choices.values()))
-    monkeypatch.setattr(benchmark, "read_rows", lambda out: [row_of(out)])
+    monkeypatch.setattr(benchmark, "read_run_records", lambda out: [row_of(out)])
     return asked
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from pipeline.bop.images import read_mask
 from pipeline.bop.results import read_results
-from pipeline.report.rows import read_rows
+from pipeline.report.run_records import read_run_records
 from pipeline.synthetic.scenes import write_dataset
 
 SMALL = (
@@ -137,7 +137,7 @@ def test_a_plan_computes_nothing_and_shows_every_node(dzop, tmp_path):
 def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, scene, cache, capsys, monkeypatch):
     ran = dzop(f"store.root={cache}", "gallery=2")
     assert ran.status == 0
-    (row,) = read_rows(tmp_path / "results")
+    (row,) = read_run_records(tmp_path / "results")
     assert row.label["extract"] == "hog"
     assert row.counts["poses"]["computed"] + row.counts["poses"]["reused"] == 4
     assert set(row.times_s) >= {"crop", "extract", "match", "cluster", "solve"}
@@ -152,7 +152,7 @@ def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, sc
     assert {name: same[name] for name in told} == pytest.approx(told)
     assert row.metrics["AR"] == pytest.approx(same["AR"])
     dzop(f"store.root={cache}", "gallery=3")
-    (again,) = read_rows(tmp_path / "results")
+    (again,) = read_run_records(tmp_path / "results")
     assert (again.at, again.counts) == (row.at, row.counts)  # the row says what the first run computed
     assert len(again.cases) == 3
     assert same["AR_VSD"] is not None

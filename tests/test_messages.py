@@ -14,7 +14,7 @@ from make_vit import write_vit
 from PIL import Image
 
 from pipeline.__main__ import _closing
-from pipeline.report.rows import read_rows, standing_failures
+from pipeline.report.run_records import read_run_records, unresolved_failures
 from pipeline.synthetic.scenes import write_dataset
 
 SMALL = ("render.count=6", "render.size=64", "method=dzop", "extract=hog", "overlays=false", "gallery=0",
@@ -68,11 +68,11 @@ def test_a_failure_is_forgotten_once_its_job_has_ended_well_with_other_weights(d
     whole = write_vit(tmp_path / "vit")
     jobs = ("extract=dino", "fuse.layers=[1]", "match.layer=1", "cluster.count=3,4")
     assert dzop(*jobs, "weights.dino=./nowhere", flags=("-m",)).status == 1
-    rows = read_rows(tmp_path / "results")
-    assert [row.config["cluster"]["count"] for row in standing_failures(rows)] == [3, 4]
+    rows = read_run_records(tmp_path / "results")
+    assert [row.config["cluster"]["count"] for row in unresolved_failures(rows)] == [3, 4]
     assert dzop(*jobs[:3], "cluster.count=4", f"weights.dino={whole}").status == 0
-    rows = read_rows(tmp_path / "results")
-    assert [row.config["cluster"]["count"] for row in standing_failures(rows)] == [3]
+    rows = read_run_records(tmp_path / "results")
+    assert [row.config["cluster"]["count"] for row in unresolved_failures(rows)] == [3]
 
 
 def test_a_sweep_ends_with_a_line_that_can_be_read(monkeypatch):

@@ -10,7 +10,7 @@ from tiny_bop import write_tiny_bop
 
 from pipeline.bop.dataset import open_dataset
 from pipeline.bop.lint import lint
-from pipeline.report.rows import read_rows
+from pipeline.report.run_records import read_run_records
 
 SMALL = ("render=raycast", "render.count=9", "render.size=96", "overlays=false", "gallery=0", "fallback=true",
          "evaluate.vsd=false")  # fmt: skip
@@ -58,7 +58,7 @@ def test_a_method_is_one_override_on_masks_and_on_detections(dzop, tmp_path, met
     for detect in ((), ("detect=json", f"detect.path={detections(tmp_path / 'found.json')}")):
         ran = dzop(f"method={method}", *METHODS[method], *detect)
         assert ran.status == 0, ran.err
-        row = max(read_rows(tmp_path / "results"), key=lambda row: row.at)
+        row = max(read_run_records(tmp_path / "results"), key=lambda row: row.at)
         assert (row.status, row.config["method"]) == ("done", method)
         csv = tmp_path / "results" / row.folder / row.csv
         assert lint(csv, open_dataset(tmp_path / "tiny", name="tiny")).faults == ()
@@ -105,7 +105,7 @@ def test_a_method_answers_photographs(
     detect = [override.format(bop_mini=bop_mini) for override in detect]
     ran = run_dzop(capsys, monkeypatch, *asked, *detect, *weights, *SMALL, f"method={method}", *METHODS[method])
     assert ran.status == 0, ran.err
-    row = read_rows(tmp_path / "results")[0]
+    row = read_run_records(tmp_path / "results")[0]
     assert row.estimates + sum(count for _, _, count in row.failures) == 1
     found = lint(tmp_path / "results" / row.folder / row.csv, data)
     assert row.estimates == found.rows

@@ -15,7 +15,7 @@ from pipeline.bop.dataset import open_dataset
 from pipeline.bop.results import ResultRow, write_results
 from pipeline.functional.rigid import rigid
 from pipeline.metrics.recall import average_recall
-from pipeline.report.rows import read_rows
+from pipeline.report.run_records import read_run_records
 from pipeline.scoring import Scorer
 
 
@@ -109,7 +109,7 @@ def test_a_pose_anywhere_is_a_miss_and_no_warning(dzop, t, recwarn):
 def test_a_row_for_the_report_keeps_the_scores(dzop):
     write_results(Path("other_tiny-test.csv"), true_rows(Path("tiny")))
     assert dzop("score", "other_tiny-test.csv", "--dataset", "tiny", "--out", "results").status == 0
-    (row,) = read_rows(Path("results"))
+    (row,) = read_run_records(Path("results"))
     assert (row.method, row.dataset.name, row.dataset.targets) == ("other", "tiny", 4)
     assert row.scores.mssd.all()
 

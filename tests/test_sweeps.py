@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pipeline.report.rows import read_rows
+from pipeline.report.run_records import read_run_records
 from pipeline.synthetic.scenes import write_dataset
 
 ROOT = Path(__file__).parents[1]
@@ -55,7 +55,7 @@ def test_a_failed_job_loses_no_other_and_is_listed_at_the_end_and_in_the_rows(co
     assert "cluster.count=-1 " in last
     assert "cluster.count: found -1, needs greater than or equal to 1" in last
     assert "Traceback" not in done.stderr
-    rows = {row.config["cluster"]["count"]: row for row in read_rows(tmp_path / "results")}
+    rows = {row.config["cluster"]["count"]: row for row in read_run_records(tmp_path / "results")}
     assert {count: row.status for count, row in rows.items()} == {4: "done", -1: "failed", 6: "done"}
     assert "cluster.count=-1" in rows[-1].overrides
     page = ran([sys.executable, "-m", "pipeline", "step=report", f"out={tmp_path}/results"])
@@ -70,7 +70,7 @@ def test_a_value_that_is_no_number_fails_its_job_alone(command, tmp_path):
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert done.stderr.strip().splitlines()[-1].startswith("error: 1 of the sweep's jobs failed: ")
-    rows = {row.status: row.config["solve"]["threshold_px"] for row in read_rows(tmp_path / "results")}
+    rows = {row.status: row.config["solve"]["threshold_px"] for row in read_run_records(tmp_path / "results")}
     assert rows == {"failed": "nan", "done": 8}
 
 
@@ -124,7 +124,7 @@ def test_a_killed_sweep_goes_on_where_it_stopped(command, tmp_path):
     assert again.stdout.count("finished before: ") == len(finished)
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in finished} == finished
     assert len(list(rows.glob("*.json"))) == 8
-    assert [row.counts["template features"]["computed"] for row in read_rows(tmp_path / "results")].count(0) >= 7
+    assert [row.counts["template features"]["computed"] for row in read_run_records(tmp_path / "results")].count(0) >= 7
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def test_a_finished_job_is_repeated_when_its_files_are_gone_or_its_inputs_change
 def test_a_sweep_is_a_file_and_gives_a_row_for_every_job(command, tmp_path, sweep, jobs):
     done = ran(command(f"sweep={sweep}"))
     assert done.returncode == 0, done.stderr
-    rows = read_rows(tmp_path / "results")
+    rows = read_run_records(tmp_path / "results")
     assert len(rows) == jobs
     assert {row.sweep for row in rows} == {sweep}
     if sweep == "ladder":

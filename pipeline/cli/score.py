@@ -17,9 +17,9 @@ from pipeline.io.files import write_json
 from pipeline.metrics.bootstrap import Interval, image_index, paired_interval
 from pipeline.metrics.recall import instance_ar
 from pipeline.progress import Progress
-from pipeline.report.rows import Row, write_row
+from pipeline.report.run_records import RunRecord, write_run_record
 from pipeline.report.scores import scores_table, summary_of
-from pipeline.scoring import VSD_DELTA_MM, Scored, Scorer, dataset_id
+from pipeline.scoring import VSD_DELTA_MM, Scorer, ScoringResult, dataset_id
 from pipeline.spec import digest
 
 TARGETS = "test_targets_bop19.json"
@@ -53,7 +53,7 @@ def score_command(arguments: Sequence[str]) -> None:
         write_json(Path(asked.json), record)
         print(f"json      {asked.json}")
     if asked.out:
-        print(f"row       {write_row(Path(asked.out), _row(ours, scored))}")
+        print(f"row       {write_run_record(Path(asked.out), _row(ours, scored))}")
 
 
 def lint_command(arguments: Sequence[str]) -> None:
@@ -157,12 +157,12 @@ def _said(given: Scoreable) -> None:
         print(f"{aside} estimates of what is not a target are left out")
 
 
-def _scored(given: Scoreable) -> Scored:
+def _scored(given: Scoreable) -> ScoringResult:
     with Progress().bar(len(given.scorer.images), given.path.name, "image") as advance:
         return given.scorer.score(given.rows, progress=advance)
 
 
-def _difference(ours: Scored, theirs: Scored) -> Interval:
+def _difference(ours: ScoringResult, theirs: ScoringResult) -> Interval:
     mine, other = ours.scores, theirs.scores
     image = image_index(mine.scene_id, mine.im_id)
     return paired_interval(instance_ar(mine), instance_ar(other), image)
@@ -172,10 +172,10 @@ def _signed(value: Interval) -> str:
     return f"{value.mean:+.4f} [{value.low:+.4f}, {value.high:+.4f}]"
 
 
-def _row(given: Scoreable, scored: Scored) -> Row:
+def _row(given: Scoreable, scored: ScoringResult) -> RunRecord:
     """A row for the report: the figures of a csv, without what only a run of ours knows."""
     identity = {"csv": file_digest(given.path), "dataset": dataset_id(given.scorer).key}
-    return Row(
+    return RunRecord(
         id=digest(identity)[:16],
         status="done",
         at=datetime.now(UTC).isoformat(timespec="seconds"),

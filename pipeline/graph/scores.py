@@ -23,7 +23,7 @@ from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors, TemplateError, errors_of, errors_record, scores_of, scores_record
 from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
-from pipeline.scoring import SCORES_VERSION, Scored, Scorer, truth_digest
+from pipeline.scoring import SCORES_VERSION, Scorer, ScoringResult, truth_digest
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
@@ -38,7 +38,7 @@ class Judged:
     ``correspondences``: median error of an instance's correspondences over its diameter, where they were asked for.
     """
 
-    scored: Scored
+    scored: ScoringResult
     of: tuple[PoseErrors | None, ...]
     templates: Mapping[Instance, TemplateError]
     correspondences: Mapping[Instance, float]
@@ -97,7 +97,7 @@ class ScoreNodes:
         errors = tuple(errors_of(record) for record in entry.document["errors"])
         templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
         return Judged(
-            Scored(errors, scores_of(entry.document["scores"]), self.scorer.models),
+            ScoringResult(errors, scores_of(entry.document["scores"]), self.scorer.models),
             _by_answer(answers, errors),
             templates,
             {(s, i, o, g): error for s, i, o, g, error in entry.document.get("correspondences", [])},

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.report.rows import UNTOLD, Row
+from pipeline.report.run_records import NOT_IDENTIFYING, RunRecord
 
 # the scores of a row hold all thresholds; rows of one section share their targets
 _SAME_SCORES = {"evaluate", "dataset", "select", "method", "variation"}
@@ -20,8 +20,8 @@ class Family:
     """Runs that differ in ``axis`` alone ("cluster.count", or "solve" for another variant), in the order of it."""
 
     axis: str
-    base: Row
-    rows: tuple[Row, ...]
+    base: RunRecord
+    rows: tuple[RunRecord, ...]
     values: tuple[Any, ...]
 
     @property
@@ -30,11 +30,11 @@ class Family:
         return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in self.values)
 
 
-def settings(row: Row) -> dict[str, Any]:
+def settings(row: RunRecord) -> dict[str, Any]:
     """What a row's answers depend on, by dotted field; the variant of a stage under the stage's own name."""
     found: dict[str, Any] = {}
     for name, value in row.config.items():
-        if name in UNTOLD or name in _SAME_SCORES:
+        if name in NOT_IDENTIFYING or name in _SAME_SCORES:
             continue
         found |= _flat(name, value)
     for name, fields in _MESHES.items():
@@ -43,7 +43,7 @@ def settings(row: Row) -> dict[str, Any]:
     return found
 
 
-def scored_by(row: Row) -> dict[str, Any]:
+def scored_by(row: RunRecord) -> dict[str, Any]:
     """What poses were held against: two runs that differ in it were not scored alike."""
     return {name: value for name, value in settings(row).items() if name.startswith("evaluate.")}
 
@@ -54,7 +54,7 @@ def difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, 
     return {name: theirs.get(name) for name in sorted(other) if not any(name.startswith(f"{o}.") for o in other)}
 
 
-def base_of(rows: Sequence[Row]) -> Row:
+def base_of(rows: Sequence[RunRecord]) -> RunRecord:
     """The run that most others are a step away from; of equals one that was no job of a sweep, or else the first.
 
     Never one with an oracle or with parts switched off, as long as there is another.
@@ -65,17 +65,17 @@ def base_of(rows: Sequence[Row]) -> Row:
     return rows[max(range(len(rows)), key=lambda i: (near[i], bool(rows[i].config), not rows[i].sweep, -i))]
 
 
-def is_oracle(row: Row) -> bool:
+def is_oracle(row: RunRecord) -> bool:
     """Whether any stage of a run was shown the truth."""
     return "oracle" in row.label.values() or "extract.coordinates." in str(row.config.get("extract"))
 
 
-def is_plain(row: Row) -> bool:
+def is_plain(row: RunRecord) -> bool:
     """Whether a run is the method as it is: no oracle, nothing switched off by a variation."""
     return not is_oracle(row) and row.config.get("variation", "none") == "none"
 
 
-def families(rows: Sequence[Row]) -> list[Family]:
+def families(rows: Sequence[RunRecord]) -> list[Family]:
     """All families of rows of one dataset, the widest base first. Rows of switched-off or oracle parts are left out."""
     left = [row for row in rows if row.config and is_plain(row)]
     left = list({str(settings(row)): row for row in reversed(left)}.values())[::-1]
@@ -91,8 +91,8 @@ def families(rows: Sequence[Row]) -> list[Family]:
     return found[:MOST_FAMILIES]
 
 
-def _around(base: Row, rows: Sequence[Row]) -> list[Family]:
-    by_axis: dict[str, list[tuple[Row, Any]]] = {}
+def _around(base: RunRecord, rows: Sequence[RunRecord]) -> list[Family]:
+    by_axis: dict[str, list[tuple[RunRecord, Any]]] = {}
     for row in rows:
         changed = difference(settings(base), settings(row))
         if len(changed) == 1:

@@ -21,7 +21,7 @@ from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
 from pipeline.metrics.recall import MSPD_PX, THETAS, by_visibility, instance_ar, recall_by_threshold
 from pipeline.report import published
 from pipeline.report.families import Family
-from pipeline.report.rows import Row
+from pipeline.report.run_records import RunRecord
 
 logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells every glyph that a PDF holds
 
@@ -119,7 +119,7 @@ def ar_head(scores: Scores) -> str:
 
 
 @mpl.rc_context(STYLE)
-def objects_figures(rows: Mapping[str, Row], dataset: str) -> list[Figure]:
+def objects_figures(rows: Mapping[str, RunRecord], dataset: str) -> list[Figure]:
     """Bars of each object's recall for some runs, a few objects a figure; the paper's beside them where it has them."""
     objects = np.unique(_scores(next(iter(rows.values()))).obj_id)
     bars = len(rows) + len(published.OBJECTS.get(dataset, {}))
@@ -127,7 +127,7 @@ def objects_figures(rows: Mapping[str, Row], dataset: str) -> list[Figure]:
     return [_objects_figure(rows, dataset, part.tolist()) for part in parts if len(part) or len(parts) == 1]
 
 
-def _objects_figure(rows: Mapping[str, Row], dataset: str, objects: Sequence[int]) -> Figure:
+def _objects_figure(rows: Mapping[str, RunRecord], dataset: str, objects: Sequence[int]) -> Figure:
     first = _scores(next(iter(rows.values())))
     theirs = published.OBJECTS.get(dataset, {})
     canvas, axes = _canvas()
@@ -152,7 +152,7 @@ def _objects_figure(rows: Mapping[str, Row], dataset: str, objects: Sequence[int
 
 
 @mpl.rc_context(STYLE)
-def theta_figure(rows: Mapping[str, Row], dataset: str) -> Figure:
+def theta_figure(rows: Mapping[str, RunRecord], dataset: str) -> Figure:
     """Recall over the upper bound of theta, measured above, published below."""
     shown = dataset if dataset in published.THETA else "lmo"
     canvas, (axes, theirs) = _two_panels()
@@ -172,7 +172,7 @@ def theta_figure(rows: Mapping[str, Row], dataset: str) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def thresholds_figure(row: Row) -> Figure:
+def thresholds_figure(row: RunRecord) -> Figure:
     """Recall at every threshold, by metric."""
     canvas, axes = _canvas()
     names = {"vsd": "VSD (mean over tau)", "mssd": "MSSD, theta of the diameter", "mspd": "MSPD, 100 theta px"}
@@ -184,7 +184,7 @@ def thresholds_figure(row: Row) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def visibility_figure(row: Row) -> Figure | None:
+def visibility_figure(row: RunRecord) -> Figure | None:
     """Recall by visible fraction; None where the dataset does not say it."""
     scores = _scores(row)
     bins = by_visibility(scores)
@@ -235,7 +235,7 @@ def family_figure(family: Family) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def times_figure(rows: Mapping[str, Row]) -> Figure:
+def times_figure(rows: Mapping[str, RunRecord]) -> Figure:
     """Median seconds of a target by stage, one bar a run."""
     canvas, axes = _canvas(height=max(2.2, 1.3 + 0.34 * len(rows)))
     stages = list(dict.fromkeys(stage for row in rows.values() for stage in row.times_s))
@@ -265,7 +265,7 @@ def _wrapped(name: str) -> str:
     return "\n".join(lines if len(lines) <= 3 else [*lines[:2], f"{lines[2]} ..."])
 
 
-def _scores(row: Row) -> Scores:
+def _scores(row: RunRecord) -> Scores:
     assert row.scores is not None
     return row.scores
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int, UInt8
 from pipeline.items.features import Clusters
 from pipeline.items.matches import Correspondences
 from pipeline.items.views import Image
-from pipeline.report.overlay import Drawn, Role, draw_overlay
+from pipeline.report.overlay import DrawnPose, Role, draw_overlay
 
 PANEL_PX = 240
 TITLE_PX = 24
@@ -54,7 +54,7 @@ class Card:
 
     photo: Image
     bbox_xyxy: tuple[float, float, float, float]
-    drawn: Sequence[Drawn]
+    drawn: Sequence[DrawnPose]
     query_rgb: Picture
     template_rgb: Picture | None = None
     clusters: Clusters | None = None

@@ -44,7 +44,7 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2,
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class DrawnPose:
     """One pose to draw. ``role`` "unchecked": an estimate without ground truth to compare with."""
 
     mesh: Mesh
@@ -53,7 +53,7 @@ class Drawn:
     label: str = ""
 
 
-def draw_overlay(image: Image, items: Sequence[Drawn], *, legend: bool = True) -> UInt8[np.ndarray, "H W 3"]:
+def draw_overlay(image: Image, items: Sequence[DrawnPose], *, legend: bool = True) -> UInt8[np.ndarray, "H W 3"]:
     """The photograph with each pose's silhouette outline, 3D box and label, and a legend unless there is to be none.
 
     Images under 1000 px are enlarged by a whole factor (at most 4). The box is the mesh's axis-aligned one in the
@@ -103,12 +103,12 @@ def _corners(mesh: Mesh) -> Float[np.ndarray, "8 3"]:
     return np.where(bits == 1, high, low)
 
 
-def _box_segments(item: Drawn, K: Float[np.ndarray, "3 3"]) -> list[Float[np.ndarray, "2 2"]]:
+def _box_segments(item: DrawnPose, K: Float[np.ndarray, "3 3"]) -> list[Float[np.ndarray, "2 2"]]:
     corners = transform(item.T_cam_obj, _corners(item.mesh))
     return list(project(K, clip_to_front(corners[np.array(_EDGES)])))
 
 
-def _outlines(item: Drawn, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> list[Float[np.ndarray, "m 2"]]:
+def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> list[Float[np.ndarray, "m 2"]]:
     """Closed outlines (and holes) of the silhouette, pixels, smoothed over five contour points."""
     if transform(item.T_cam_obj, _corners(item.mesh))[:, 2].max() < _NEAR_MM:
         return []
@@ -138,7 +138,7 @@ def _lines(
 
 
 def _written(
-    canvas: UInt8[np.ndarray, "H W 3"], items: Sequence[Drawn], K: Float[np.ndarray, "3 3"], *, legend: bool
+    canvas: UInt8[np.ndarray, "H W 3"], items: Sequence[DrawnPose], K: Float[np.ndarray, "3 3"], *, legend: bool
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The canvas with labels and, at the lower left, a legend of the roles drawn."""
     picture = PIL.Image.fromarray(canvas)

@@ -21,7 +21,7 @@ from pipeline.items.scores import Scores
 from pipeline.report import figures, tables
 from pipeline.report.families import Family, base_of, families, is_oracle, scored_by
 from pipeline.report.figures import Figure, ar_interval, ar_name
-from pipeline.report.rows import Row, standing_failures
+from pipeline.report.run_records import RunRecord, unresolved_failures
 from pipeline.report.tables import Table, run_name
 
 FOLDER = "report"
@@ -52,30 +52,30 @@ class Shown:
 class Section:
     """Everything about the runs on one set of targets; nothing is compared across sections."""
 
-    jobs: Sequence[Row]
+    jobs: Sequence[RunRecord]
     title: str
 
     @cached_property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[RunRecord]:
         """One of the jobs that gave the same scores, such as those that differ in theta_max alone."""
-        kept: dict[tuple[str, str, str], Row] = {}
+        kept: dict[tuple[str, str, str], RunRecord] = {}
         for row in sorted(self.jobs, key=lambda row: (not row.cases, bool(row.sweep))):
             kept.setdefault((row.run, row.config.get("variation", "none"), str(scored_by(row))), row)
         return [row for row in self.jobs if row in kept.values()]
 
     @cached_property
-    def base(self) -> Row:
+    def base(self) -> RunRecord:
         """The run that the others are held against."""
         return base_of(self.rows)
 
     @cached_property
-    def comparable(self) -> list[Row]:
+    def comparable(self) -> list[RunRecord]:
         """The runs whose recall means the same as the base run's: all with VSD, or all without, on the same meshes."""
         without, how = _scored(self.base).vsd is None, scored_by(self.base)
         return [row for row in self.rows if (_scored(row).vsd is None) == without and scored_by(row) == how]
 
     @cached_property
-    def best(self) -> Row:
+    def best(self) -> RunRecord:
         """The run with the highest recall; oracles, which see the truth, are no candidates."""
         honest = [row for row in self.comparable if not is_oracle(row)] or [self.base]
         return max(honest, key=lambda row: ar_interval(_scored(row)).mean)
@@ -106,7 +106,7 @@ class Section:
         return list(dict.fromkeys(f"{row.method}: {row.notice}" for row in self.rows if row.notice))
 
     @cached_property
-    def methods(self) -> list[tuple[str, Row]]:
+    def methods(self) -> list[tuple[str, RunRecord]]:
         """One run of each method, the base run's first, of each the one nearest to it."""
         chosen = {self.base.method: self.base}
         for row in sorted(self.comparable, key=lambda row: len(run_name(row, self.base))):
@@ -119,7 +119,7 @@ class Section:
         """The ablations."""
         return families(self.comparable)
 
-    def name(self, row: Row) -> str:
+    def name(self, row: RunRecord) -> str:
         """A run by what sets it apart."""
         return run_name(row, self.base)
 
@@ -150,7 +150,7 @@ class Section:
             "times": [figures.times_figure(dict(list(timed.items())[:_TIMES_SHOWN]))] if timed else [],
         }
 
-    def _timed(self, row: Row) -> bool:
+    def _timed(self, row: RunRecord) -> bool:
         return row in dict(self.methods).values() or row.config.get("variation", "none").startswith("no_")
 
     def tables(self) -> dict[str, list[Table]]:
@@ -165,16 +165,16 @@ class Section:
         }
         return {part: [table for table in made if table is not None] for part, made in by_part.items()}
 
-    def galleries(self) -> list[Row]:
+    def galleries(self) -> list[RunRecord]:
         """Runs whose pictures are shown: the base run's, and the best one's."""
         return [row for row in dict.fromkeys([self.base, self.best, *self.rows]) if row.cases][:2]
 
 
-def write_report(rows: Sequence[Row], out: Path) -> Report:
+def write_report(rows: Sequence[RunRecord], out: Path) -> Report:
     """Write the page of all rows, its figures and tables to ``out/report``; a reader sees a whole page or the old."""
     folder = out / FOLDER
     sections = sections_of(rows)
-    failed = standing_failures(rows)
+    failed = unresolved_failures(rows)
     pictures = _Pictures(out)
     parts = []
     made = [(section, section.figures(), section.tables()) for section in sections]
@@ -200,9 +200,9 @@ def write_report(rows: Sequence[Row], out: Path) -> Report:
     return Report(folder / "index.html", _summary(sections, failed, folder))
 
 
-def sections_of(rows: Sequence[Row]) -> list[Section]:
+def sections_of(rows: Sequence[RunRecord]) -> list[Section]:
     """Rows with scores by the targets they are of, the newest first; sections of one name are told apart."""
-    by_key: dict[str, list[Row]] = {}
+    by_key: dict[str, list[RunRecord]] = {}
     for row in rows:
         if row.dataset is not None and row.scores is not None:
             by_key.setdefault(row.dataset.key, []).append(row)
@@ -222,7 +222,7 @@ class _Pictures:
     def __init__(self, out: Path) -> None:
         self.out, self.used, self.left_out = out, 0, 0
 
-    def of(self, row: Row) -> list[Shown]:
+    def of(self, row: RunRecord) -> list[Shown]:
         shown = []
         for case in row.cases:
             path = self.out / row.folder / case.file
@@ -293,13 +293,13 @@ def _write_table(folder: Path, table: Table, name: str | None = None) -> None:
     write_atomic(folder / f"{name or table.name}.tex", table.latex())
 
 
-def _summary(sections: Sequence[Section], failed: Sequence[Row], folder: Path) -> str:
+def _summary(sections: Sequence[Section], failed: Sequence[RunRecord], folder: Path) -> str:
     lines = [f"{section.title}: {len(section.jobs)} runs; {section.headline()}" for section in sections]
     lines += [f"failed: {' '.join(row.overrides)} ({row.error})" for row in failed]
     lines.append(f"page      {folder / 'index.html'}\nfigures   {folder / 'figures'}\ntables    {folder / 'tables'}")
     return "\n".join(lines)
 
 
-def _scored(row: Row) -> Scores:
+def _scored(row: RunRecord) -> Scores:
     assert row.scores is not None
     return row.scores

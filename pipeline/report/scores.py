@@ -17,13 +17,13 @@ from pipeline.metrics.recall import (
     instance_recalls,
     recall_by_threshold,
 )
-from pipeline.scoring import Scored
+from pipeline.scoring import ScoringResult
 
 ADD_LIMIT = 0.1
 """ADD and ADI count as right below this part of the diameter (Hinterstoisser et al., ACCV 2012)."""
 
 
-def scores_table(scored: Scored, *, theta_max: float = 0.5) -> str:
+def scores_table(scored: ScoringResult, *, theta_max: float = 0.5) -> str:
     """Average recalls with their intervals, by object and by visible fraction; and why VSD is not there, if so."""
     scores = scored.scores
     recall = average_recall(scores, theta_max=theta_max)
@@ -44,7 +44,7 @@ def scores_table(scored: Scored, *, theta_max: float = 0.5) -> str:
     return "\n".join([*lines, _errors_line(scored)])
 
 
-def intervals(scored: Scored, *, theta_max: float = 0.5) -> dict[str, Interval]:
+def intervals(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, Interval]:
     """Bootstrap intervals over images, by metric; those that are not available are left out."""
     scores = scored.scores
     values, image = instance_recalls(scores, theta_max=theta_max), image_index(scores.scene_id, scores.im_id)
@@ -56,7 +56,7 @@ def intervals(scored: Scored, *, theta_max: float = 0.5) -> dict[str, Interval]:
     return {name: mean_interval(column, image) for name, column in columns.items()}
 
 
-def summary_of(scored: Scored, *, theta_max: float = 0.5) -> dict[str, Any]:
+def summary_of(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, Any]:
     """Every figure, JSON-able; None for what is not available."""
     scores, recall = scored.scores, average_recall(scored.scores, theta_max=theta_max)
     return {
@@ -78,7 +78,7 @@ def metrics_of(recall: AverageRecall) -> dict[str, float | None]:
     return {"AR": recall.ar, "AR_VSD": recall.vsd, "AR_MSSD": recall.mssd, "AR_MSPD": recall.mspd}
 
 
-def error_recalls(scored: Scored) -> dict[str, float | None]:
+def error_recalls(scored: ScoringResult) -> dict[str, float | None]:
     """Shares of the instances that an estimate hits within 0.1 diameters by ADD and ADI; medians over estimates."""
     nearest = _nearest(scored)
     found = dict.fromkeys(("recall_ADD", "recall_ADI"), 0.0)
@@ -94,7 +94,7 @@ def error_recalls(scored: Scored) -> dict[str, float | None]:
     }
 
 
-def _nearest(scored: Scored) -> list[PoseErrors]:
+def _nearest(scored: ScoringResult) -> list[PoseErrors]:
     """Each estimate's errors against the instance it is nearest to by MSSD."""
     by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
     for error in scored.errors:
@@ -110,7 +110,7 @@ def _line(name: str, recall: AverageRecall, remark: str) -> str:
     return f"{name:<10}{cells}   {remark}"
 
 
-def _errors_line(scored: Scored) -> str:
+def _errors_line(scored: ScoringResult) -> str:
     values = error_recalls(scored)
     line = f"ADD < 0.1 diameters: {values['recall_ADD']:.4f}, ADI: {values['recall_ADI']:.4f} of the instances"
     if values["median_rotation_deg"] is None or values["median_translation_mm"] is None:

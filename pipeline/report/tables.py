@@ -18,7 +18,7 @@ from pipeline.progress import format_bytes
 from pipeline.report import published
 from pipeline.report.families import Family, difference, is_oracle, settings
 from pipeline.report.figures import ar_head, ar_interval, value_text
-from pipeline.report.rows import Row
+from pipeline.report.run_records import RunRecord
 
 NONE = "n/a"
 READINGS = ("geodesic", "direction", "vectorised")
@@ -55,7 +55,7 @@ class Table:
         )
 
 
-def runs_table(rows: Sequence[Row], base: Row) -> Table:
+def runs_table(rows: Sequence[RunRecord], base: RunRecord) -> Table:
     """Every run that ended well, the best first, and its difference to the base run, paired over images."""
     ordered = sorted(rows, key=lambda row: -ar_interval(_scores(row)).mean)
     without = _scores(base).vsd is None
@@ -66,7 +66,7 @@ def runs_table(rows: Sequence[Row], base: Row) -> Table:
     return Table("runs", caption, "measured", head, tuple(_run(row, base) for row in ordered))
 
 
-def _run(row: Row, base: Row) -> tuple[str, ...]:
+def _run(row: RunRecord, base: RunRecord) -> tuple[str, ...]:
     scores = _scores(row)
     alike = scores if _scores(base).vsd is not None else replace(scores, vsd=None)  # the column's head is the base's
     spread = ar_interval(alike)
@@ -88,7 +88,7 @@ def _run(row: Row, base: Row) -> tuple[str, ...]:
     )
 
 
-def templates_table(methods: Sequence[tuple[str, Row]]) -> Table:
+def templates_table(methods: Sequence[tuple[str, RunRecord]]) -> Table:
     """Acc15 and the mean angle to the true view, in the three readings."""
     head = ("run", *(f"Acc15 {reading}" for reading in READINGS), *(f"error {reading}" for reading in READINGS))
     body = []
@@ -111,12 +111,12 @@ def family_table(family: Family) -> Table:
     return Table(name, f"Runs that differ in {family.axis} alone.", "measured", head, tuple(body))
 
 
-def _point(row: Row) -> tuple[str, str]:
+def _point(row: RunRecord) -> tuple[str, str]:
     spread = ar_interval(_scores(row))
     return _number(spread.mean), f"{_number(spread.low)} to {_number(spread.high)}"
 
 
-def correspondence_table(rows: Sequence[Row]) -> Table | None:
+def correspondence_table(rows: Sequence[RunRecord]) -> Table | None:
     """The paper's table "Correspondence estimation", from the runs of its variations; None without them."""
     parts = {"no_coprojection": (0, 1, 0), "no_clusters": (1, 0, 0), "no_subpixel": (1, 1, 0), "none": (1, 1, 1)}
     by_name = {row.config.get("variation", "none"): row for row in _one_method(rows, "no_subpixel")}
@@ -133,7 +133,7 @@ def correspondence_table(rows: Sequence[Row]) -> Table | None:
     return Table("correspondence", "Correspondence estimation.", "measured", head, tuple(body))
 
 
-def ladder_table(rows: Sequence[Row]) -> Table | None:
+def ladder_table(rows: Sequence[RunRecord]) -> Table | None:
     """The oracle ladder: what each true part that is put in gains over the rung before; None without its runs."""
     rungs = {"none": "as estimated", "oracle_mask": "true mask", "oracle_template": "true mask, template",
              "oracle_correspondences": "true mask, template, correspondences"}  # fmt: skip
@@ -150,14 +150,14 @@ def ladder_table(rows: Sequence[Row]) -> Table | None:
     return Table("ladder", "Oracle ladder: where is the loss?", "measured", head, tuple(body))
 
 
-def _one_method(rows: Sequence[Row], variation: str) -> list[Row]:
+def _one_method(rows: Sequence[RunRecord], variation: str) -> list[RunRecord]:
     """Of a variation's rows and those they can be held against, the ones of the newest such run's settings."""
     newest = next((row for row in reversed(rows) if row.config.get("variation") == variation), None)
     if newest is None:
         return []
     switched = {"fuse", "cluster", "detect", "match", "correspond"}
 
-    def fixed(row: Row) -> dict[str, object]:
+    def fixed(row: RunRecord) -> dict[str, object]:
         return {k: v for k, v in settings(row).items() if k.split(".")[0] not in switched}
 
     mine = [row for row in rows if fixed(row) == fixed(newest) and _same_metric(row, newest)]
@@ -169,11 +169,11 @@ def _one_method(rows: Sequence[Row], variation: str) -> list[Row]:
     return [*special, *nearest]
 
 
-def _same_metric(ours: Row, theirs: Row) -> bool:
+def _same_metric(ours: RunRecord, theirs: RunRecord) -> bool:
     return (_scores(ours).vsd is None) == (_scores(theirs).vsd is None)
 
 
-def improvement_table(methods: Sequence[tuple[str, Row]]) -> Table | None:
+def improvement_table(methods: Sequence[tuple[str, RunRecord]]) -> Table | None:
     """Relative improvement of the first method over each other one; None with one method alone."""
     if len(methods) < 2:
         return None
@@ -190,19 +190,19 @@ def improvement_table(methods: Sequence[tuple[str, Row]]) -> Table | None:
     return Table("improvement", caption, "measured", head, tuple(body))
 
 
-def counts_table(rows: Sequence[Row], base: Row) -> Table:
+def counts_table(rows: Sequence[RunRecord], base: RunRecord) -> Table:
     """What each job computed and what it found in the cache."""
     body = [(run_name(row, base), *(_count(row, step) for step in COUNTED)) for row in rows]
     caption = "Computed + reused, by job: a sweep over matching computes no template and no feature."
     return Table("counts", caption, "measured", ("run", *COUNTED), tuple(body))
 
 
-def _count(row: Row, step: str) -> str:
+def _count(row: RunRecord, step: str) -> str:
     count = row.counts.get(step)
     return NONE if count is None else f"{count['computed']:.0f} + {count['reused']:.0f}"
 
 
-def times_table(rows: Sequence[tuple[str, Row]]) -> Table:
+def times_table(rows: Sequence[tuple[str, RunRecord]]) -> Table:
     """Median seconds of a target by stage."""
     stages = list(dict.fromkeys(stage for _, row in rows for stage in row.times_s))
     body = []
@@ -212,7 +212,7 @@ def times_table(rows: Sequence[tuple[str, Row]]) -> Table:
     return Table("times", "Median seconds of a target by stage.", "measured", ("run", *stages, "all"), tuple(body))
 
 
-def failures_table(rows: Sequence[Row], base: Row) -> Table | None:
+def failures_table(rows: Sequence[RunRecord], base: RunRecord) -> Table | None:
     """Why targets have no pose, by run; None where all have one."""
     body = [(run_name(row, base), stage, reason, str(count)) for row in rows for stage, reason, count in row.failures]
     head = ("run", "stage", "reason", "targets")
@@ -250,7 +250,7 @@ def published_column(dataset: str) -> Table | None:
                  "published", ("method", "training", "AR"), methods)  # fmt: skip
 
 
-def run_name(row: Row, base: Row) -> str:
+def run_name(row: RunRecord, base: RunRecord) -> str:
     """What sets a run apart from the base run; the method's name where that is another."""
     if row.id == base.id or not row.config:
         return row.method
@@ -266,7 +266,7 @@ def run_name(row: Row, base: Row) -> str:
     return " ".join(([] if row.method == base.method and told else [row.method]) + told)
 
 
-def paired(ours: Row, theirs: Row) -> Interval | None:
+def paired(ours: RunRecord, theirs: RunRecord) -> Interval | None:
     """The difference of two runs, paired over images; None for other instances."""
     a, b = _scores(ours), _scores(theirs)
     if a.instances() != b.instances() or (a.vsd is None) != (b.vsd is None):
@@ -282,18 +282,18 @@ def signed(value: Interval | None) -> str:
     return f"{value.mean:+.3f} ({value.low:+.3f} to {value.high:+.3f}){star}"
 
 
-def template_angles(row: Row, reading: str) -> np.ndarray:
+def template_angles(row: RunRecord, reading: str) -> np.ndarray:
     """Angles of the instances that had a template matched, degrees."""
     return np.array([getattr(error, reading) for error in row.templates.values()])
 
 
-def acc15(row: Row, reading: str) -> float:
+def acc15(row: RunRecord, reading: str) -> float:
     """Share of all instances whose template lies within 15 degrees; NaN where no template is known."""
     angles = template_angles(row, reading)
     return float((angles < ACC_DEG).sum() / max(len(_scores(row)), 1)) if len(angles) else float("nan")
 
 
-def _scores(row: Row) -> Scores:
+def _scores(row: RunRecord) -> Scores:
     assert row.scores is not None
     return row.scores
 

@@ -3,14 +3,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_rows import toy_row
+from toy_runs import toy_run
 
 from pipeline.report import figures
 from pipeline.report.families import families
 
 
 def of_many_objects(count: int):
-    row = toy_row(instances=2 * count)
+    row = toy_run(instances=2 * count)
     return replace(row, scores=replace(row.scores, obj_id=np.arange(2 * count) % count + 1))
 
 
@@ -29,7 +29,7 @@ def test_many_objects_are_shared_out_over_figures_of_few_bars(runs):
 
 def test_published_bars_are_hollow_dashed_and_only_of_their_own_dataset():
     def published(dataset):
-        (axes,) = figures.objects_figures({"run": toy_row()}, dataset)[0].canvas.axes
+        (axes,) = figures.objects_figures({"run": toy_run()}, dataset)[0].canvas.axes
         return [bars for bars in axes.containers if "published" in str(bars.get_label())]
 
     assert published("demo") == []
@@ -40,7 +40,7 @@ def test_published_bars_are_hollow_dashed_and_only_of_their_own_dataset():
 
 def test_the_papers_curve_has_axes_of_its_own_and_other_axes_have_none():
     known, unknown = (
-        figures.family_figure(families([toy_row(), toy_row(**change)])[0])
+        figures.family_figure(families([toy_run(), toy_run(**change)])[0])
         for change in ({"cluster__count": 40}, {"match__top_k": 5})
     )
     measured, published = known.canvas.axes
@@ -55,11 +55,11 @@ def test_a_metric_keeps_its_colour_where_vsd_is_missing():
         (axes,) = figures.thresholds_figure(row).canvas.axes
         return {line.get_label()[:4]: line.get_color() for line in axes.lines}
 
-    assert colours(toy_row(vsd=False)).items() < colours(toy_row()).items()
+    assert colours(toy_run(vsd=False)).items() < colours(toy_run()).items()
 
 
 def test_a_figure_is_real_text_and_the_same_every_time():
-    first, second = (figures.theta_figure({"run": toy_row()}, "demo").svg() for _ in range(2))
+    first, second = (figures.theta_figure({"run": toy_run()}, "demo").svg() for _ in range(2))
     assert first == second
     assert ">published, LM-O<" in first.replace("</tspan>", "")
     assert "<metadata>" not in first
@@ -67,7 +67,7 @@ def test_a_figure_is_real_text_and_the_same_every_time():
 
 def test_names_of_any_length_leave_the_axes_their_room():
     long = "match.layer=8, " * 12 + "solve._target_=pipeline.stages.solve.poselib.PoseLib"
-    rows = {long: toy_row(), long + " too": toy_row(0.3)}
+    rows = {long: toy_run(), long + " too": toy_run(0.3)}
     drawn = figures.times_figure(rows), figures.theta_figure(rows, "demo"), *figures.objects_figures(rows, "demo")
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # matplotlib gives up its layout with a warning

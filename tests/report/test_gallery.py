@@ -18,7 +18,7 @@ from pipeline.report.gallery import (
     paint_clusters,
     pick_cases,
 )
-from pipeline.report.overlay import Drawn
+from pipeline.report.overlay import DrawnPose
 from pipeline.synthetic.objects import make_object
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
@@ -121,7 +121,7 @@ def test_a_detection_at_the_border_is_shown_whole(bbox):
     photo = Image(1, 0, np.full((240, 320, 3), 255, np.uint8), K)
     mesh, T = make_object(0), np.eye(4)
     T[2, 3] = 900.0
-    shown = draw_card(Card(photo, bbox, [Drawn(mesh, T, "correct")], grey()))
+    shown = draw_card(Card(photo, bbox, [DrawnPose(mesh, T, "correct")], grey()))
     assert shown.shape[1] == 2 * PANEL_PX + GAP_PX
 
 

@@ -9,7 +9,7 @@ from pipeline.functional.camera import mask_bbox
 from pipeline.functional.rigid import rigid
 from pipeline.items.objects import Mesh
 from pipeline.items.views import Image
-from pipeline.report.overlay import Drawn, clip_to_front, draw_overlay, write_overlay
+from pipeline.report.overlay import DrawnPose, clip_to_front, draw_overlay, write_overlay
 
 FACES = np.array([(0, 2, 1), (1, 2, 3), (4, 5, 6), (5, 7, 6), (0, 1, 4), (1, 5, 4), (2, 6, 3), (3, 6, 7)])
 FACES = np.concatenate([FACES, [(0, 4, 2), (2, 4, 6), (1, 3, 5), (3, 7, 5)]])
@@ -32,7 +32,7 @@ def coloured(picture: np.ndarray, role: str) -> np.ndarray:
 
 def test_picture_does_not_change_the_photograph_and_is_repeatable():
     image = photo()
-    items = [Drawn(CUBE, at(0, 0, 300), "truth"), Drawn(CUBE, at(5, 0, 300), "correct", "object 1")]
+    items = [DrawnPose(CUBE, at(0, 0, 300), "truth"), DrawnPose(CUBE, at(5, 0, 300), "correct", "object 1")]
     first = draw_overlay(image, items)
     np.testing.assert_array_equal(first, draw_overlay(image, items))
     assert (image.rgb == 128).all()
@@ -47,7 +47,7 @@ def test_small_images_are_enlarged_and_large_ones_are_not():
 @pytest.mark.parametrize("role", list(COLOURS))
 def test_outline_surrounds_the_silhouette_in_the_colour_of_its_role(role: str):
     near_mm, factor = 300 - 30, 4  # the near face is the silhouette of a cube seen from the front
-    picture = draw_overlay(photo(), [Drawn(CUBE, at(10, -5, 300), role)])
+    picture = draw_overlay(photo(), [DrawnPose(CUBE, at(10, -5, 300), role)])
     drawn = coloured(picture, role)
     drawn[500:, :300] = False  # the legend
     x0, y0, x1, y1 = mask_bbox(drawn)
@@ -58,13 +58,13 @@ def test_outline_surrounds_the_silhouette_in_the_colour_of_its_role(role: str):
 
 
 def test_estimate_lies_over_ground_truth_whatever_the_order():
-    truth, estimate = Drawn(CUBE, at(0, 0, 300), "truth"), Drawn(CUBE, at(0, 0, 300), "correct")
+    truth, estimate = DrawnPose(CUBE, at(0, 0, 300), "truth"), DrawnPose(CUBE, at(0, 0, 300), "correct")
     np.testing.assert_array_equal(draw_overlay(photo(), [truth, estimate]), draw_overlay(photo(), [estimate, truth]))
     assert coloured(draw_overlay(photo(), [truth, estimate])[:500], "correct").sum() > 500
 
 
 def test_legend_names_only_what_is_drawn():
-    picture = draw_overlay(photo(), [Drawn(CUBE, at(0, 0, -300), "wrong")])
+    picture = draw_overlay(photo(), [DrawnPose(CUBE, at(0, 0, -300), "wrong")])
     assert coloured(picture, "wrong")[500:, :300].any()
     for role in ("truth", "correct", "unchecked"):
         assert not coloured(picture, role).any()
@@ -75,7 +75,7 @@ def test_legend_names_only_what_is_drawn():
     "where", [(0, 0, -300), (0, 0, 10), (0, 0, 35), (4000, 0, 300), (0, 0, 1e7), (1e9, -1e9, 1e-3)]
 )
 def test_no_pose_however_wild_stops_the_picture(where: tuple[float, float, float]):
-    picture = draw_overlay(photo(), [Drawn(CUBE, at(*where), "wrong", "object 1  0.12")])
+    picture = draw_overlay(photo(), [DrawnPose(CUBE, at(*where), "wrong", "object 1  0.12")])
     assert picture.shape == (640, 800, 3)
 
 
@@ -87,7 +87,7 @@ def test_edges_are_cut_at_the_near_plane():
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
 def test_written_picture_is_whole_and_alone_in_its_folder(tmp_path: Path, name: str):
-    picture = draw_overlay(photo(), [Drawn(CUBE, at(0, 0, 300), "correct", "object 1")])
+    picture = draw_overlay(photo(), [DrawnPose(CUBE, at(0, 0, 300), "correct", "object 1")])
     write_overlay(tmp_path / "deep" / name, picture)
     assert [p.name for p in (tmp_path / "deep").iterdir()] == [name]
     with PIL.Image.open(tmp_path / "deep" / name) as back:
@@ -101,7 +101,7 @@ def test_outline_of_the_ground_truth_lies_on_its_mask_in_a_photograph(bop_mini: 
     truth = dataset.ground_truth(100, 1)[0]  # object 8, visible to 1.0
     mesh = dataset.object_model(8).mesh
     image = Image(100, 1, np.zeros_like(dataset.image(100, 1).rgb), dataset.image(100, 1).K)
-    drawn = coloured(draw_overlay(image, [Drawn(mesh, truth.T_cam_obj, "truth")]), "truth")
+    drawn = coloured(draw_overlay(image, [DrawnPose(mesh, truth.T_cam_obj, "truth")]), "truth")
     drawn[860:, :250] = False  # the legend
     box = np.array(mask_bbox(dataset.mask(100, 1, 0)))
     # 4 px of the enlarged picture: half a line's width and the annotation's own pixel

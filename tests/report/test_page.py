@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from toy_rows import failed_row, toy_row
+from toy_runs import failed_run, toy_run
 
 from pipeline.errors import BadInput
 from pipeline.report.page import Section, _breakable, sections_of, write_report
-from pipeline.report.rows import Case, read_rows, write_row
+from pipeline.report.run_records import Case, read_run_records, write_run_record
 
 LIMIT_BYTES = 15_000_000
 
@@ -20,7 +20,7 @@ def page(rows, out) -> str:
 
 @pytest.fixture(scope="module")
 def rows():
-    return [toy_row(0.5), *(toy_row(0.3 + n / 1000, at=n // 10, cluster__count=n) for n in (40, 80, 130)), failed_row()]
+    return [toy_run(0.5), *(toy_run(0.3 + n / 1000, at=n // 10, cluster__count=n) for n in (40, 80, 130)), failed_run()]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_what_a_run_says_is_text_and_no_markup(built):
 
 
 def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
-    other = [toy_row(0.9, key="q" * 64, at=50, instances=21)]
+    other = [toy_run(0.9, key="q" * 64, at=50, instances=21)]
     found = sections_of([*rows, *other])
     assert [len(section.rows) for section in found] == [1, 4]
     assert found[0].title.startswith("demo test: 21 targets")
@@ -81,7 +81,7 @@ def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
 
 
 def test_runs_that_differ_in_reported_thresholds_alone_are_shown_once(rows):
-    twins = [toy_row(0.5, evaluate__theta_max=bound) for bound in (0.1, 0.2)]
+    twins = [toy_run(0.5, evaluate__theta_max=bound) for bound in (0.1, 0.2)]
     section = Section([*rows[:4], *twins], "demo")
     assert len(section.rows) == 4
     assert len(section.jobs) == 6
@@ -93,15 +93,15 @@ def test_a_random_models_notice_cannot_be_missed(built):
 
 
 def test_missing_vsd_is_told_and_never_a_zero(tmp_path):
-    text = page([toy_row(vsd=False)], tmp_path)
+    text = page([toy_run(vsd=False)], tmp_path)
     assert "VSD, and with it BOP's AR, is not available: no depth" in re.sub(r"&#39;", "'", text)
     assert ">n/a<" in text
 
 
 def test_a_run_scored_on_other_meshes_is_shown_by_name_and_never_the_best():
-    base = toy_row(0.5, evaluate={"models": "models_eval"})
-    easier = toy_row(0.9, evaluate={"models": "models"})
-    section = Section([base, toy_row(0.4, evaluate={"models": "models_eval"}, cluster__count=40), easier], "demo")
+    base = toy_run(0.5, evaluate={"models": "models_eval"})
+    easier = toy_run(0.9, evaluate={"models": "models"})
+    section = Section([base, toy_run(0.4, evaluate={"models": "models_eval"}, cluster__count=40), easier], "demo")
     assert section.best is base
     assert section.name(easier) == "evaluate.models=models"
     twins = [base, replace(easier, run=base.run)]
@@ -109,10 +109,10 @@ def test_a_run_scored_on_other_meshes_is_shown_by_name_and_never_the_best():
 
 
 def test_published_recalls_of_a_dataset_stand_beside_its_runs_marked_so(tmp_path):
-    text = page([toy_row(name="lmo")], tmp_path)
+    text = page([toy_run(name="lmo")], tmp_path)
     own = text[: text.index('<section id="published">')]
     assert own.count("AR of single-shot methods on LM-O") == 2  # caption and its label
-    assert "AR of single-shot methods on" not in page([toy_row()], tmp_path)
+    assert "AR of single-shot methods on" not in page([toy_run()], tmp_path)
 
 
 def test_long_names_break_between_their_parts():
@@ -120,15 +120,15 @@ def test_long_names_break_between_their_parts():
 
 
 def test_rows_of_failures_alone_and_of_a_csv_still_make_a_page(tmp_path):
-    assert "found -1" in page([failed_row()], tmp_path / "a")
-    foreign = replace(toy_row(), config={}, label={}, times_s={}, counts={}, templates={}, method="megapose")
-    text = page([foreign, toy_row()], tmp_path / "b")
+    assert "found -1" in page([failed_run()], tmp_path / "a")
+    foreign = replace(toy_run(), config={}, label={}, times_s={}, counts={}, templates={}, method="megapose")
+    text = page([foreign, toy_run()], tmp_path / "b")
     assert "megapose" in text
 
 
 def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
-    rows = [toy_row(0.5, instances=1000)]
-    rows += [toy_row(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(20)]
+    rows = [toy_run(0.5, instances=1000)]
+    rows += [toy_run(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(20)]
     noise = np.random.default_rng(0).integers(0, 256, (1058, 486, 3), dtype=np.uint8)  # compresses worse than any card
     folder = tmp_path / rows[0].folder / "gallery"
     folder.mkdir(parents=True)
@@ -149,7 +149,7 @@ def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
 
 def test_an_oracle_is_never_the_base_nor_the_best_and_always_named(tmp_path):
     oracle = {"_target_": "pipeline.stages.match.oracle.Oracle", "layer": 2, "top_k": 1}
-    shown = [toy_row(0.9, variation="oracle_template", match=oracle), toy_row(0.95, match=oracle), toy_row(0.4)]
+    shown = [toy_run(0.9, variation="oracle_template", match=oracle), toy_run(0.95, match=oracle), toy_run(0.4)]
     section = Section(shown, "demo")
     assert section.base is shown[2]
     assert section.best is shown[2]
@@ -157,7 +157,7 @@ def test_an_oracle_is_never_the_base_nor_the_best_and_always_named(tmp_path):
 
 
 def test_a_run_without_vsd_has_no_ar_beside_runs_that_have_one():
-    with_vsd, without = toy_row(0.4), toy_row(0.9, vsd=False, cluster__count=40)
+    with_vsd, without = toy_run(0.4), toy_run(0.9, vsd=False, cluster__count=40)
     section = Section([with_vsd, without], "demo")
     assert section.best is with_vsd
     assert section.families == []
@@ -168,12 +168,12 @@ def test_a_run_without_vsd_has_no_ar_beside_runs_that_have_one():
 
 def test_rows_on_disk_make_the_page(rows, tmp_path):
     for row in (rows[0], rows[-1]):
-        write_row(tmp_path, row)
-    report = write_report(read_rows(tmp_path), tmp_path)
+        write_run_record(tmp_path, row)
+    report = write_report(read_run_records(tmp_path), tmp_path)
     assert "1 runs; AR" in report.summary
     assert "failed: cluster.count=-1" in report.summary
-    with pytest.raises(BadInput, match="needs the rows of runs"):
-        read_rows(tmp_path / "empty")
+    with pytest.raises(BadInput, match="needs finished runs"):
+        read_run_records(tmp_path / "empty")
 
 
 def test_files_of_runs_that_are_gone_do_not_lie_beside_a_new_page(rows, tmp_path):

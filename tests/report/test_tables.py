@@ -2,7 +2,7 @@ import csv
 import io
 
 import pytest
-from toy_rows import toy_row
+from toy_runs import toy_run
 
 from pipeline.metrics.recall import average_recall
 from pipeline.report import published, tables
@@ -15,7 +15,7 @@ def columns(table: tables.Table) -> list[dict[str, str]]:
 
 
 def test_a_difference_is_paired_and_starred_when_it_is_more_than_chance():
-    base, better, same = toy_row(0.4), toy_row(0.6, cluster__count=40), toy_row(0.4, cluster__count=80)
+    base, better, same = toy_run(0.4), toy_run(0.6, cluster__count=40), toy_run(0.4, cluster__count=80)
     rows = {row["run"]: row for row in columns(tables.runs_table([base, better, same], base))}
     assert rows["dzop-hog"]["to base"] == "base"
     assert rows["cluster.count=40"]["to base"].endswith("*")
@@ -25,7 +25,7 @@ def test_a_difference_is_paired_and_starred_when_it_is_more_than_chance():
 
 
 def test_without_vsd_the_mean_of_two_is_not_called_ar():
-    row = toy_row(vsd=False)
+    row = toy_run(vsd=False)
     (told,) = columns(tables.runs_table([row], row))
     assert "AR" not in told
     assert told["AR_VSD"] == "n/a"
@@ -33,7 +33,7 @@ def test_without_vsd_the_mean_of_two_is_not_called_ar():
 
 
 def test_a_run_with_vsd_among_runs_without_shows_the_mean_of_two_under_that_name():
-    base, other = toy_row(vsd=False), toy_row(cluster__count=40)
+    base, other = toy_run(vsd=False), toy_run(cluster__count=40)
     (_, told) = sorted(columns(tables.runs_table([base, other], base)), key=lambda row: row["run"], reverse=True)
     assert told["run"] == "cluster.count=40"
     assert told["AR_MSSD+MSPD"].split()[0] == f"{average_recall(other.scores).mssd_mspd:.3f}"
@@ -43,15 +43,15 @@ def test_no_table_calls_the_mean_of_two_ar():
     concat = {"_target_": "pipeline.stages.fuse.concat.Concat"}
     oracle = {"_target_": "pipeline.stages.match.oracle.Oracle"}
     rows = [
-        toy_row(vsd=False),
-        toy_row(vsd=False, variation="no_coprojection", fuse=concat, correspond__kernel=1),
-        toy_row(vsd=False, variation="oracle_template", match=oracle),
+        toy_run(vsd=False),
+        toy_run(vsd=False, variation="no_coprojection", fuse=concat, correspond__kernel=1),
+        toy_run(vsd=False, variation="oracle_template", match=oracle),
     ]
-    family = families([rows[0], toy_row(vsd=False, cluster__count=40)])[0]
+    family = families([rows[0], toy_run(vsd=False, cluster__count=40)])[0]
     made = [
-        tables.correspondence_table([*rows, toy_row(vsd=False, variation="no_subpixel", correspond__kernel=1)]),
+        tables.correspondence_table([*rows, toy_run(vsd=False, variation="no_subpixel", correspond__kernel=1)]),
         tables.ladder_table(rows),
-        tables.improvement_table([("ours", rows[0]), ("theirs", toy_row(vsd=False, method="zs6d"))]),
+        tables.improvement_table([("ours", rows[0]), ("theirs", toy_run(vsd=False, method="zs6d"))]),
         tables.family_table(family),
     ]
     for table in made:
@@ -60,33 +60,33 @@ def test_no_table_calls_the_mean_of_two_ar():
 
 
 def test_runs_on_other_instances_have_no_difference():
-    assert tables.paired(toy_row(), toy_row(instances=21)) is None
+    assert tables.paired(toy_run(), toy_run(instances=21)) is None
     assert tables.signed(None) == "n/a"
 
 
 def test_the_correspondence_table_has_the_papers_four_rows():
     concat, one = {"_target_": "pipeline.stages.fuse.concat.Concat"}, {"_target_": "pipeline.stages.cluster.one.One"}
     rows = [
-        toy_row(0.1, variation="no_coprojection", fuse=concat, correspond__kernel=1),
-        toy_row(0.2, variation="no_clusters", cluster=one, correspond__kernel=1),
-        toy_row(0.3, variation="no_subpixel", correspond__kernel=1),
-        toy_row(0.4),
-        toy_row(0.9, cluster__count=40),
+        toy_run(0.1, variation="no_coprojection", fuse=concat, correspond__kernel=1),
+        toy_run(0.2, variation="no_clusters", cluster=one, correspond__kernel=1),
+        toy_run(0.3, variation="no_subpixel", correspond__kernel=1),
+        toy_run(0.4),
+        toy_run(0.9, cluster__count=40),
     ]
     table = tables.correspondence_table(rows)
     assert [row[:3] for row in table.rows] == [
         ("no", "yes", "no"), ("yes", "no", "no"), ("yes", "yes", "no"), ("yes", "yes", "yes"),
     ]  # fmt: skip
     assert [row[3] for row in table.rows] == [f"{ar_interval(row.scores).mean:.3f}" for row in rows[:4]]
-    assert tables.correspondence_table([toy_row(), toy_row(cluster__count=40)]) is None
+    assert tables.correspondence_table([toy_run(), toy_run(cluster__count=40)]) is None
 
 
 def test_the_ladder_says_what_each_rung_gains():
     oracle = {"_target_": "pipeline.stages.match.oracle.Oracle", "layer": 2, "top_k": 1}
     rows = [
-        toy_row(0.2),
-        toy_row(0.3, variation="oracle_mask"),
-        toy_row(0.6, variation="oracle_template", match=oracle),
+        toy_run(0.2),
+        toy_run(0.3, variation="oracle_mask"),
+        toy_run(0.6, variation="oracle_template", match=oracle),
     ]
     table = tables.ladder_table(rows)
     assert [row[0] for row in table.rows] == ["as estimated", "true mask", "true mask, template"]
@@ -96,7 +96,7 @@ def test_the_ladder_says_what_each_rung_gains():
 
 
 def test_improvements_are_relative_to_the_other_method():
-    ours, theirs = toy_row(0.6), toy_row(0.4, method="zs6d-dino")
+    ours, theirs = toy_run(0.6), toy_run(0.4, method="zs6d-dino")
     (row,) = tables.improvement_table([("dzop-hog", ours), ("zs6d-dino", theirs)]).rows
     assert row[0] == "dzop-hog over zs6d-dino"
     assert row[1] == "+12.5%"  # 14 degrees instead of 16
@@ -106,7 +106,7 @@ def test_improvements_are_relative_to_the_other_method():
 
 
 def test_jobs_say_what_they_computed_and_what_they_reused():
-    row = toy_row()
+    row = toy_run()
     (told,) = columns(tables.counts_table([row], row))
     assert told["template features"] == "0 + 900"
     assert told["query features"] == "n/a"
@@ -115,14 +115,14 @@ def test_jobs_say_what_they_computed_and_what_they_reused():
 def test_every_csv_row_says_whether_it_was_measured_or_published():
     for table in tables.published_tables():
         assert {row["source"] for row in columns(table)} == {"published"}
-    base = toy_row()
-    family = families([base, toy_row(cluster__count=40)])[0]
+    base = toy_run()
+    family = families([base, toy_run(cluster__count=40)])[0]
     for table in (tables.runs_table([base], base), tables.family_table(family), tables.failures_table([base], base)):
         assert {row["source"] for row in columns(table)} == {"measured"}
 
 
 def test_latex_escapes_what_it_would_read():
-    table = tables.failures_table([toy_row()], toy_row())
+    table = tables.failures_table([toy_run()], toy_run())
     assert r"<\&>" in table.latex()
     assert table.latex().count("&") - table.latex().count(r"\&") == 2 * 3
     assert r"50\,\%" not in table.latex()

@@ -16,7 +16,7 @@ from pipeline.bop.dataset import open_dataset
 from pipeline.bop.jsonio import read_json
 from pipeline.bop.masks import encode
 from pipeline.errors import BadInput
-from pipeline.report.rows import read_rows
+from pipeline.report.run_records import read_run_records
 from pipeline.stages.detect.json import Json
 
 FILES = {
@@ -142,13 +142,13 @@ def test_rows_of_reports_are_read_or_refused_in_one_line(tmp_path_factory, data)
     row |= {"cases": [], "scores": None, "templates": [], "overrides": [], "failures": [], "counts": {}, "times_s": {}}
     text = json.dumps(mutated(data.draw, row))
     (folder / "a.json").write_bytes(broken(data.draw, text) if data.draw(st.booleans()) else text.encode())
-    outcome(lambda: read_rows(folder.parent))
+    outcome(lambda: read_run_records(folder.parent))
 
 
 def test_a_row_nested_too_deeply_is_refused(tmp_path: Path):
     (tmp_path / "rows").mkdir()
     (tmp_path / "rows" / "a.json").write_bytes(b"[" * 100_000)
-    assert "a.json: found RecursionError" in outcome(lambda: read_rows(tmp_path))
+    assert "a.json: found RecursionError" in outcome(lambda: read_run_records(tmp_path))
 
 
 HOSTILE = {

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.items.scores import DatasetId, Scores, TemplateError
-from pipeline.report.rows import Row, row_id
+from pipeline.report.run_records import RunRecord, run_id
 
 CONFIG: dict[str, Any] = {
     "method": "dzop",
@@ -48,8 +48,8 @@ def toy_scores(level: float, *, instances: int = 24, vsd: bool = True, seed: int
     return Scores(*ids, rng.random(instances), mssd, difficulty < thresholds - 0.4, surface, "" if vsd else "no depth")
 
 
-def toy_row(level: float = 0.5, *, at: int = 0, key: str = "k" * 64, method: str = "dzop-hog", name: str = "demo",
-            vsd: bool = True, instances: int = 24, **changes: Any) -> Row:  # fmt: skip
+def toy_run(level: float = 0.5, *, at: int = 0, key: str = "k" * 64, method: str = "dzop-hog", name: str = "demo",
+            vsd: bool = True, instances: int = 24, **changes: Any) -> RunRecord:  # fmt: skip
     """A finished run; ``changes``: fields of the configuration, dots written as two underscores."""
     config = changed({name.replace("__", "."): value for name, value in changes.items()})
     scores = toy_scores(level, vsd=vsd, instances=instances)
@@ -58,8 +58,8 @@ def toy_row(level: float = 0.5, *, at: int = 0, key: str = "k" * 64, method: str
     counts = {
         step: {"computed": 0, "reused": 900, "time_s": 0.0} for step in ("templates", "template features", "poses")
     }
-    return Row(
-        id=row_id(config | {"of": f"{key} {method}"}),
+    return RunRecord(
+        id=run_id(config | {"of": f"{key} {method}"}),
         status="done",
         at=f"2026-01-01T00:00:{at:02d}",
         method=method,
@@ -67,7 +67,7 @@ def toy_row(level: float = 0.5, *, at: int = 0, key: str = "k" * 64, method: str
         sweep="toy" if changes else "",
         label={"extract": "hog", "match": config["match"]["_target_"].split(".")[-2]},
         dataset=DatasetId(name, "test", key, instances, (instances + 2) // 3, (1, 2, 3)),
-        run=row_id({k: v for k, v in config.items() if k != "evaluate"} | {"of": f"{key} {method} {level}"}),
+        run=run_id({k: v for k, v in config.items() if k != "evaluate"} | {"of": f"{key} {method} {level}"}),
         folder="dzop-hog_demo-test/abc",
         csv="dzop-hog_demo-test.csv",
         estimates=instances - 1,
@@ -80,10 +80,10 @@ def toy_row(level: float = 0.5, *, at: int = 0, key: str = "k" * 64, method: str
     )
 
 
-def failed_row() -> Row:
+def failed_run() -> RunRecord:
     config = changed({"cluster.count": -1})
-    return Row(
-        id=row_id(config),
+    return RunRecord(
+        id=run_id(config),
         status="failed",
         at="2026-01-01T00:01:00",
         method="dzop",
