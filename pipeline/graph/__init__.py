@@ -137,7 +137,7 @@ class Graph:
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
         self.detect()  # first: a fault in its files must not wait for hours of onboarding
-        if not self.run.store.complete(self.poses.run_ref()):
+        if not self.run.store.is_complete(self.poses.run_ref()):
             for obj_id in self.run.object_ids:
                 self.run.model(obj_id)  # nor must a mesh that does not fit its annotations
         self.onboard()

@@ -142,11 +142,11 @@ class Context:
 
         ``work``: what decides the seconds of a row, for plans; "" where nobody asks.
         """
-        if all(self.store.complete(ref) for ref in refs):
+        if all(self.store.is_complete(ref) for ref in refs):
             self.progress.add(step, reused=rows)
             return
         with self.progress.bar(rows, title, "row") as advance:
-            filled = self.store.fill(refs, rows=rows, batch=batch, compute=compute, document=document, progress=advance)
+            filled = self.store.fill(refs, rows=rows, batch=batch, compute=compute, document=document, advance=advance)
         self.progress.add(step, computed=filled.computed, reused=filled.reused, time_s=filled.time_s)
         if work and filled.computed:
             self.rates.note(work, filled.computed, filled.time_s)
@@ -155,7 +155,7 @@ class Context:
         self, step: str, title: str, refs: Mapping[int, Ref], rows: int, crops: Callable[[list[int]], Crops]
     ) -> None:
         """Features of the layers that are missing, in as few passes as possible: one for all of them."""
-        missing = {layer: ref for layer, ref in refs.items() if not self.store.complete(ref)}
+        missing = {layer: ref for layer, ref in refs.items() if not self.store.is_complete(ref)}
         if not missing:
             self.progress.add(step, reused=rows)
             return

@@ -48,12 +48,12 @@ class DetectionNodes:
     @property
     def known(self) -> bool:
         """Whether they can be had without proposing or describing anything."""
-        return self.proposals is None or self.run.store.complete(self.ref)
+        return self.proposals is None or self.run.store.is_complete(self.ref)
 
     @cached_property
     def all(self) -> list[Detection]:
         """Detections of the targets, made once."""
-        fresh = not self.run.store.complete(self.ref)
+        fresh = not self.run.store.is_complete(self.ref)
         if fresh:
             found = self._find()
             self.run.store.put_document(self.ref, [detection_record(d) for d in found], rows=len(found))

@@ -88,7 +88,7 @@ class Plan:
         n, of, stages = self._views(obj_id), f"object {obj_id}", self.run.stages
         refs = {layer: self.templates.features(obj_id, layer) for layer in stages.layers}
         yield from self._features("template features", of, refs, n)
-        missing = [fit for fit in stages.fits if not self.run.store.complete(self.templates.fitted(obj_id, fit))]
+        missing = [fit for fit in stages.fits if not self.run.store.is_complete(self.templates.fitted(obj_id, fit))]
         for fit in stages.fits:
             size = fit.array_bytes(stages.extract.feature_shape(fit.layer)[0], n)
             share = 1 / len(missing) if missing else 0
@@ -128,7 +128,7 @@ class Plan:
     ) -> Iterator[Node]:
         """A node for every layer; those that are missing come of one pass, which the first of them pays for."""
         run = run or self.run
-        missing = [layer for layer, ref in refs.items() if not run.store.complete(ref)]
+        missing = [layer for layer, ref in refs.items() if not run.store.is_complete(ref)]
         work = work_of("features", run.stages, missing) if missing else ""
         for layer, ref in refs.items():
             pays = rows if layer in missing[:1] else 0

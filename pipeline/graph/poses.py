@@ -73,14 +73,14 @@ class PoseNodes:
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target and for every target without one."""
         ref = self.run_ref()
-        if not self.run.store.complete(ref):
+        if not self.run.store.is_complete(ref):
             self._make(ref)
         answers = [answer_of(record) for record in self.run.store.read(ref).document["answers"]]
         self._count_reused(len(answers))
         return answers
 
     def _make(self, ref: Ref) -> None:
-        missing = [group for group in self.groups if not self.run.store.complete(self.poses(group))]
+        missing = [group for group in self.groups if not self.run.store.is_complete(self.poses(group))]
         self._make_queries(sorted({(t.scene_id, t.im_id) for group in missing for t in self.groups[group]}))
         total = sum(len(self.groups[group]) for group in missing)
         with self.run.progress.bar(total, "poses", "target") as advance:
@@ -103,7 +103,7 @@ class PoseNodes:
     @cached_property
     def solving(self) -> Work[tuple[int, int]]:
         """Poses, by scene and object."""
-        done, size = self.run.store.complete, self.groups
+        done, size = self.run.store.is_complete, self.groups
         return Work("poses", self._solve, lambda group: done(self.poses(group)), lambda group: len(size[group]))
 
     def _solve(self, group: tuple[int, int], advance: Advance) -> None:

@@ -74,7 +74,7 @@ class ProposalNodes:
         return Work("descriptions", self._describe, lambda obj_id: self._complete(self.template_features(obj_id)))
 
     def _complete(self, ref: Ref) -> bool:
-        return self.run.store.complete(ref)
+        return self.run.store.is_complete(ref)
 
     def _describe(self, obj_id: int, advance: Advance) -> None:
         count = self.templates.make_templates(obj_id)
@@ -143,7 +143,7 @@ class ProposalNodes:
 
     def _make_proposals(self, image: ImageId) -> list[Proposal]:
         ref = self.proposals(image)
-        fresh = not self.run.store.complete(ref)
+        fresh = not self.run.store.is_complete(ref)
         if fresh:
             propose = self.proposing  # loading its weights is no part of an image's seconds
             start = time.perf_counter()
@@ -159,7 +159,7 @@ class ProposalNodes:
     def _make_crops(self, image: ImageId, proposals: Sequence[Proposal]) -> int:
         """Crop an image's proposals; returns how many could be cropped."""
         ref = self.crops(image)
-        if self.run.store.complete(ref):
+        if self.run.store.is_complete(ref):
             return self.run.store.read(ref).rows
         start = time.perf_counter()
         photo = self.run.dataset.image(*image)

@@ -91,7 +91,7 @@ class QueryNodes:
         return Work("query features", self._describe, self._described)
 
     def _described(self, image: ImageId) -> bool:
-        complete = self.run.store.complete
+        complete = self.run.store.is_complete
         if not complete(self.crops(image)):
             return False
         layers = self.run.stages.layers
@@ -104,7 +104,7 @@ class QueryNodes:
     def make_crops(self, image: ImageId) -> list[Found]:
         """Crop an image's detections; those that cannot be cropped are left out, with their reason."""
         ref = self.crops(image)
-        if self.run.store.complete(ref):
+        if self.run.store.is_complete(ref):
             self.run.progress.add("query crops", reused=self.run.store.read(ref).rows)
             return self.found(image)
         began = time.perf_counter()

@@ -88,7 +88,7 @@ class ScoreNodes:
 
     def judge(self, answers: Sequence[Answer]) -> Judged:
         """Scores of the run's answers, read or made."""
-        fresh = not self.run.store.complete(self.ref)
+        fresh = not self.run.store.is_complete(self.ref)
         if fresh:
             self._make(answers)
         entry = self.run.store.read(self.ref)

@@ -91,7 +91,7 @@ class TemplateNodes:
     def make_templates(self, obj_id: int) -> int:
         """Render what is missing of an object's templates; returns how many there are."""
         ref = self.templates(obj_id)
-        if self.run.store.complete(ref):
+        if self.run.store.is_complete(ref):
             rows = self.run.store.read(ref).rows
             self.run.progress.add("templates", reused=rows)
             return rows
@@ -167,10 +167,10 @@ class TemplateNodes:
     def make_fitted(self, obj_id: int) -> None:
         """Fit what is missing to an object's templates; what a fit stands on comes before it."""
         cells, began = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer)), time.perf_counter()
-        missing = [fit for fit in self.run.stages.fits if not self.run.store.complete(self.fitted(obj_id, fit))]
+        missing = [fit for fit in self.run.stages.fits if not self.run.store.is_complete(self.fitted(obj_id, fit))]
         for fit in self.run.stages.fits:
             ref, start = self.fitted(obj_id, fit), time.perf_counter()
-            if self.run.store.complete(ref):
+            if self.run.store.is_complete(ref):
                 self.run.progress.add("fits", reused=1)
                 continue
             base = {} if fit.base is None else self.read_fitted(obj_id, fit.base, device="cpu")
@@ -217,7 +217,7 @@ class TemplateNodes:
         refs = [self.templates(obj_id), self.crops(obj_id)]
         refs += [self.features(obj_id, layer) for layer in self.run.stages.layers]
         refs += [self.fitted(obj_id, fit) for fit in self.run.stages.fits]
-        return all(map(self.run.store.complete, refs))
+        return all(map(self.run.store.is_complete, refs))
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)

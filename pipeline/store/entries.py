@@ -79,14 +79,14 @@ class Store:
 
     # --- state -----------------------------------------------------------------------------------------------------
 
-    def complete(self, ref: Ref) -> bool:
+    def is_complete(self, ref: Ref) -> bool:
         """Whether the entry is whole as far as its own records say; array bytes are checked when read."""
         group = self._group(ref.path)
         return group is not None and completeness(dict(group.attrs), ref.key) is not None
 
     def state(self, ref: Ref) -> str:
         """``cached``, ``partial`` or ``missing``."""
-        if self.complete(ref):
+        if self.is_complete(ref):
             return "cached"
         return "partial" if self._group(ref.path) is not None else "missing"
 
@@ -125,7 +125,7 @@ class Store:
         One that another process completed meanwhile is left as it is: somebody may be reading it.
         """
         with self._exclusive([ref]):
-            if self.complete(ref):
+            if self.is_complete(ref):
                 return
             attributes = finished(ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)))
             self._open(ref, attributes).attrs.put(attributes)
@@ -138,7 +138,7 @@ class Store:
         batch: int,
         compute: Callable[[list[int]], Rows],
         document: Mapping[str, Any] | None = None,
-        progress: Callable[[int], None] = lambda rows: None,
+        advance: Callable[[int], None] = lambda rows: None,
     ) -> Filled:
         """Entries that share their rows, made whole: only batches with a missing row are computed.
 
@@ -147,7 +147,7 @@ class Store:
         """
         start, computed = time.perf_counter(), 0
         with self._exclusive(list(refs)):
-            open_refs = {ref: layouts for ref, layouts in refs.items() if not self.complete(ref)}
+            open_refs = {ref: layouts for ref, layouts in refs.items() if not self.is_complete(ref)}
             arrays = {ref: self._arrays(ref, layouts, rows) for ref, layouts in open_refs.items()}
             done = {ref: self._rows_done(ref, arrays[ref]) for ref in open_refs}
             for first in range(0, rows, batch):
@@ -158,7 +158,7 @@ class Store:
                     for ref in lacking:
                         self._write(arrays[ref], values[ref.key], wanted)
                     computed += len(wanted)
-                progress(len(wanted))
+                advance(len(wanted))
             seconds = time.perf_counter() - start
             for ref, layouts in open_refs.items():
                 nbytes = sum(layout.nbytes(rows) for layout in layouts.values())

@@ -76,7 +76,7 @@ def work(store: Store) -> tuple[bytes, object]:
     """A step in small: what is missing is made, then everything is read."""
     made = lambda rows: {REF.key: {"maps": VALUES[rows]}}  # noqa: E731
     store.fill({REF: LAYOUT}, rows=5, batch=2, compute=made)
-    if not store.complete(DOCUMENT):
+    if not store.is_complete(DOCUMENT):
         store.put_document(DOCUMENT, {"answers": [1, 2.5]}, rows=2)
     return store.read(REF).array("maps").tobytes(), store.read(DOCUMENT).document
 

@@ -87,8 +87,8 @@ def test_entries_that_share_rows_are_filled_in_one_pass(store: Store):
     log: list[list[int]] = []
     fill(store, log, refs=(REF, OTHER))
     assert len(log) == 3
-    assert store.complete(REF)
-    assert store.complete(OTHER)
+    assert store.is_complete(REF)
+    assert store.is_complete(OTHER)
 
 
 def test_a_layer_that_is_there_is_left_alone_when_another_is_added(store: Store):
@@ -96,7 +96,7 @@ def test_a_layer_that_is_there_is_left_alone_when_another_is_added(store: Store)
     before = store.attributes(REF.path)
     fill(store, refs=(REF, OTHER))
     assert store.attributes(REF.path) == before
-    assert store.complete(OTHER)
+    assert store.is_complete(OTHER)
 
 
 def test_a_row_of_zeros_is_a_row_like_any_other(store: Store):
@@ -178,7 +178,7 @@ def test_changed_metadata_is_found(local: Store):
 def test_a_broken_record_makes_the_entry_a_miss(local: Store, text: str):
     fill(local)
     (entry_folder(local) / "zarr.json").write_text(text)
-    assert not local.complete(REF)
+    assert not local.is_complete(REF)
     fill(local)
     np.testing.assert_array_equal(local.read(REF).array("maps"), values(list(range(ROWS))))
 
@@ -187,7 +187,7 @@ def test_a_changed_document_makes_the_entry_a_miss(local: Store):
     local.put_document(REF, {"pose": 1.0}, rows=1)
     record = entry_folder(local) / "zarr.json"
     record.write_text(record.read_text().replace('"pose": 1.0', '"pose": 2.0'))
-    assert not local.complete(REF)
+    assert not local.is_complete(REF)
 
 
 def test_verify_reads_every_byte_and_gc_removes_only_what_is_incomplete(local: Store):
@@ -243,7 +243,7 @@ def test_a_killed_process_leaves_no_entry_that_looks_complete_and_no_lock(tmp_pa
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     store = Store(LocalStoreConfig(root=str(tmp_path / "cache")))
-    assert not store.complete(REF)
+    assert not store.is_complete(REF)
     log: list[list[int]] = []
     filled = store.fill({REF: LAYOUT}, rows=200, batch=1, compute=lambda rows: compute(rows, log))
     assert 0 < filled.reused < 200

@@ -146,13 +146,13 @@ def test_a_fault_while_reading_is_no_missing_entry(s3):
     with faulty(s3) as server:
         store = Store(s3.config(endpoint_url=f"http://127.0.0.1:{server.server_address[1]}"))
         server.faults = lambda command, path: True
-        for look in (lambda: store.complete(REF), lambda: store.read(REF)):
+        for look in (lambda: store.is_complete(REF), lambda: store.read(REF)):
             with pytest.raises(StoreUnreachable):
                 look()
         server.faults = lambda command, path: "/maps/c/" in path
         with pytest.raises(StoreUnreachable):
             store.read(REF).array("maps")
-    assert Store(s3.config()).complete(REF)
+    assert Store(s3.config()).is_complete(REF)
 
 
 def _fill_together(fields: dict, barrier, answers) -> None:
