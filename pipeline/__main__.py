@@ -39,7 +39,7 @@ from pydantic.dataclasses import is_pydantic_dataclass
 from pipeline.cli.cache import cache_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.errors import BadInput, DzopError
-from pipeline.io.checkpoints import NotFetched, offline
+from pipeline.io.checkpoints import NotDownloaded, offline
 from pipeline.io.files import write_atomic
 from pipeline.route import SecondLook, Stages
 from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
@@ -221,7 +221,7 @@ def stages_of(values: Mapping[str, Any]) -> Stages:
 def _model_of(extract: Any) -> str:
     try:
         return str(extract.model)
-    except NotFetched:
+    except NotDownloaded:
         return str(extract.kind)  # a head is trained on weights that ship, never on such as have to be fetched
 
 

@@ -14,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.bop.detections import write_detections
-from pipeline.bop.results import results_name, rows_of, write_results
+from pipeline.bop.results import make_rows, results_name, write_results
 from pipeline.graph import Graph, Judged, Retraced, ScoreNodes
 from pipeline.io.files import write_json
 from pipeline.items.poses import NoEstimate, PoseEstimate
-from pipeline.items.records import Answer, record_of
-from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, errors_record
+from pipeline.items.records import Answer, answer_to_record
+from pipeline.items.scores import CORRECT_MSSD, PoseErrors, TemplateError, errors_to_record
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.report.gallery import Card, draw_card, pick_cases
 from pipeline.report.overlay import DrawnPose, draw_overlay, write_overlay
@@ -91,9 +91,11 @@ class Outputs:
         if self.graph.detections.proposals:
             self.write_detections()
         estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
-        write_results(self.folder / self.csv, rows_of(estimates, _seconds_by_image(answers)))
+        write_results(self.folder / self.csv, make_rows(estimates, _seconds_by_image(answers)))
         errors = _errors(answers, judged)
-        told = [record_of(a) | {"errors": e and errors_record(e)} for a, e in zip(answers, errors, strict=True)]
+        told = [
+            answer_to_record(a) | {"errors": e and errors_to_record(e)} for a, e in zip(answers, errors, strict=True)
+        ]
         record = {
             "run": self.graph.poses.run_ref().key,
             "method": self.name,

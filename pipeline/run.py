@@ -14,7 +14,7 @@ from pydantic import Field
 from pipeline.bop.dataset import Dataset
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes, use_threads
-from pipeline.io.checkpoints import NotFetched
+from pipeline.io.checkpoints import NotDownloaded
 from pipeline.io.digests import remember_in
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
@@ -152,14 +152,14 @@ def _plan(graph: Graph, options: Options) -> None:
     try:
         graph.check()
         print(_headline(options, run.stages, run.dataset, run.targets, run.store), flush=True)
-    except NotFetched as fault:
+    except NotDownloaded as fault:
         unknown = fault
     try:
         for node in graph.planned():
             nodes.append(node)  # one by one: those before an unknown one are kept
         if (scores := _scores(graph, options)) and graph.detections.known:
             nodes.append(scores.node())
-    except NotFetched as fault:
+    except NotDownloaded as fault:
         unknown = fault
     print(plan_table(nodes))
     if unknown is not None:

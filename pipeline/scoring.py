@@ -22,7 +22,7 @@ from pipeline.functional.rigid import rotation_angle_deg
 from pipeline.items.objects import Mesh, ObjectModel
 from pipeline.items.scores import DatasetId, PoseErrors, Scores
 from pipeline.items.views import Target
-from pipeline.metrics.matching import best_scored, match
+from pipeline.metrics.matching import match_instances, select_best_scored
 from pipeline.metrics.pose_error import (
     add,
     adi,
@@ -121,7 +121,7 @@ class Scorer:
         estimates: Mapping[tuple[int, int, int], list[int]],
     ) -> _Found:
         mine = estimates.get((target.scene_id, target.im_id, target.obj_id), [])
-        best = [mine[i] for i in best_scored([rows[i].score for i in mine], target.inst_count)]
+        best = [mine[i] for i in select_best_scored([rows[i].score for i in mine], target.inst_count)]
         return _find(view, self.truths(target), self.counted(target), [(index, rows[index]) for index in best])
 
     def truths(self, target: Target) -> list[GroundTruth]:
@@ -273,6 +273,6 @@ def _hits(errors: Float[np.ndarray, "e g"], thresholds: Float[np.ndarray, " k"])
     """Which instances are found at each threshold."""
     found = np.zeros((errors.shape[1], len(thresholds)), dtype=bool)
     for k, threshold in enumerate(thresholds):
-        for _, gt in match(errors, threshold):
+        for _, gt in match_instances(errors, threshold):
             found[gt, k] = True
     return found

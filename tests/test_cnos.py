@@ -16,7 +16,7 @@ from presets import QUICK
 
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.detections import write_detections
-from pipeline.bop.masks import encode
+from pipeline.bop.masks import encode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.graph import Context, Graph
@@ -62,7 +62,7 @@ class TrueMasks(Spec):
             for rows in (slice(0, 30), slice(-30, None)):
                 masks.append(np.zeros(image.rgb.shape[:2], bool))
                 masks[-1][rows, :30] = True
-            return [Proposal(box, encode(mask), 0.9) for mask in masks if (box := mask_bbox(mask))]
+            return [Proposal(box, encode_rle(mask), 0.9) for mask in masks if (box := mask_bbox(mask))]
 
         return propose
 

@@ -13,7 +13,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.rigid import rotation_angle_deg, rotation_between
 from pipeline.graph import Context, Graph
 from pipeline.items.poses import NoEstimate
-from pipeline.items.records import answer_of, record_of
+from pipeline.items.records import answer_from_record, answer_to_record
 from pipeline.spec import Runtime
 from pipeline.stages.correspond.oracle import Oracle as CorrespondOracle
 from pipeline.stages.extract.coordinates import Coordinates
@@ -97,10 +97,10 @@ def test_an_answer_without_a_pose_keeps_its_template_and_old_records_still_read(
     graph = graph_of(scene, solve=Epnp(min_inliers=100000))
     answers = graph.estimate()
     assert all(isinstance(answer, NoEstimate) and answer.template_id is not None for answer in answers)
-    record = record_of(answers[0])
-    assert answer_of(record) == answers[0]
+    record = answer_to_record(answers[0])
+    assert answer_from_record(record) == answers[0]
     del record["template_id"]
-    assert answer_of(record).template_id is None
+    assert answer_from_record(record).template_id is None
 
 
 def test_without_ground_truth_behind_a_detection_the_oracle_says_what_it_needs(scene):

@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.backbones.pretrained import load_pretrained
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import everywhere, fetched, is_local, read_json
+from pipeline.io.checkpoints import fetch_snapshot, is_local, read_json, sweep_hint
 
 FIELD = "detect.proposals.weights"
 _NAME = "sam"  # below weights in the configuration
@@ -43,9 +43,9 @@ def find(weights: str, revision: str | None) -> SamWeights:
     """What lies in a folder or at a hub id. Raises BadInput for what is no SAM or no safetensors."""
     path = Path(weights).expanduser()
     if not is_local(weights):
-        path = fetched(weights, revision, _PATTERNS, field=FIELD, name=_NAME)
+        path = fetch_snapshot(weights, revision, _PATTERNS, field=FIELD, name=_NAME)
     elif not path.exists():
-        needed = "a folder of SamModel or Sam2Model" + everywhere(_NAME)
+        needed = "a folder of SamModel or Sam2Model" + sweep_hint(_NAME)
         raise BadInput(FIELD, found=f"{weights!r}, which does not exist", needed=needed)
     config = path / "config.json"
     model_type = read_json(config).get("model_type")

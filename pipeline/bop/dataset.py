@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.bop.images import image_size, read_depth, read_mask, read_rgb
-from pipeline.bop.jsonio import brief, integer, place, read_json
+from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
 from pipeline.bop.models import ModelInfo, check_model_files, read_model, read_models_info
 from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
 from pipeline.errors import BadInput
@@ -71,7 +71,7 @@ class Dataset:
         return tuple(sorted({(target.scene_id, target.im_id) for target in self.targets}))
 
     @property
-    def told_where(self) -> str:
+    def location_field(self) -> str:
         """The field by which a user said where the object is, "" where nothing did."""
         return ""
 
@@ -85,7 +85,9 @@ class Dataset:
         if scene_id not in self._scenes:
             folder = self.root / self.split / f"{scene_id:06d}"
             if not folder.is_dir():
-                raise BadInput(place(folder, scene=scene_id), found="no such folder", needed="the scene's folder")
+                raise BadInput(
+                    describe_place(folder, scene=scene_id), found="no such folder", needed="the scene's folder"
+                )
             self._scenes[scene_id] = Scene(folder, scene_id)
         return self._scenes[scene_id]
 
@@ -120,7 +122,7 @@ class Dataset:
                 return width
         if self.name in BOP_WIDTH_PX:
             return BOP_WIDTH_PX[self.name]
-        where = place(self.scene(scene_id).folder, scene=scene_id, image=im_id)
+        where = describe_place(self.scene(scene_id).folder, scene=scene_id, image=im_id)
         raise BadInput(where, found="neither a photograph nor a depth image", needed="one of them, for its width")
 
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
@@ -135,7 +137,7 @@ class Dataset:
         """Measured depth along the optical axis, mm, 0 where unknown."""
         scale = self.scene(scene_id).camera(im_id).depth_scale
         if scale is None:
-            where = place(self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id)
+            where = describe_place(self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id)
             raise BadInput(f"{where}, field depth_scale", found="nothing", needed="mm per unit of the depth image")
         return read_depth(self.depth_path(scene_id, im_id), scale)
 
@@ -176,7 +178,9 @@ class Dataset:
 
     def where_camera(self, scene_id: int, im_id: int) -> str:
         """Where the file gives an image's K, for messages."""
-        return place(self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id, field="cam_K")
+        return describe_place(
+            self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id, field="cam_K"
+        )
 
 
 def open_dataset(
@@ -219,18 +223,18 @@ def _check_folder(path: Path, what: str, fits: Callable[[Path], bool]) -> None:
 def _read_targets(path: Path) -> tuple[Target, ...]:
     records = read_json(path)
     if not isinstance(records, list) or not records:
-        raise BadInput(path, found=brief(records), needed="a list of targets: scene_id, im_id, obj_id, inst_count")
+        raise BadInput(path, found=abbreviate(records), needed="a list of targets: scene_id, im_id, obj_id, inst_count")
     asked = []
     for index, record in enumerate(records):
-        where = place(path, target=index)
-        ids = [integer(record, name, where) for name in ("scene_id", "im_id", "obj_id", "inst_count")]
+        where = describe_place(path, target=index)
+        ids = [get_integer(record, name, where) for name in ("scene_id", "im_id", "obj_id", "inst_count")]
         if min(ids) < 0 or ids[-1] < 1:
-            raise BadInput(where, found=brief(record), needed="ids >= 0 and inst_count >= 1")
+            raise BadInput(where, found=abbreviate(record), needed="ids >= 0 and inst_count >= 1")
         asked.append(Target(*ids))
     repeated = [key for key, n in Counter((t.scene_id, t.im_id, t.obj_id) for t in asked).items() if n > 1]
     if repeated:
         scene_id, im_id, obj_id = repeated[0]
-        where = place(path, scene=scene_id, image=im_id, object=obj_id)
+        where = describe_place(path, scene=scene_id, image=im_id, object=obj_id)
         raise BadInput(where, found="the target twice", needed="one entry with its inst_count")
     return _sorted(asked)
 

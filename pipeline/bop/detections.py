@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.bop.masks import runs
+from pipeline.bop.masks import to_uncompressed
 from pipeline.io.files import write_json
 from pipeline.items.views import Detection
 
@@ -26,4 +26,4 @@ def _entry(d: Detection) -> dict[str, Any]:
         "score": d.score,
         "time": d.time_s,
     }
-    return entry if d.rle is None else entry | {"segmentation": runs(d.rle)}
+    return entry if d.rle is None else entry | {"segmentation": to_uncompressed(d.rle)}

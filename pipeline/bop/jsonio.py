@@ -64,7 +64,7 @@ def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 _ID = re.compile(r"-?[0-9]{1,18}")
 
 
-def by_id(path: Path) -> dict[int, Any]:
+def read_by_id(path: Path) -> dict[int, Any]:
     """A JSON object keyed by ids ("17": ...), as scene_camera.json and models_info.json are."""
     content = read_json(path)
     if not isinstance(content, dict):
@@ -78,13 +78,13 @@ def by_id(path: Path) -> dict[int, Any]:
     return found
 
 
-def place(path: Path, *, field: str = "", **ids: int) -> str:
+def describe_place(path: Path, *, field: str = "", **ids: int) -> str:
     """Where in a file: ``place(p, scene=2, image=17, field="cam_K")`` is "p, scene 2, image 17, field cam_K"."""
     parts = [str(path), *(f"{name} {value}" for name, value in ids.items()), *([f"field {field}"] if field else [])]
     return ", ".join(parts)
 
 
-def get(record: Any, field: str, where: str) -> Any:
+def get_field(record: Any, field: str, where: str) -> Any:
     """A field of a JSON object. Raises BadInput when it is not there."""
     if not isinstance(record, dict):
         raise BadInput(where, found=f"a JSON {_kind(record)}", needed=f"a JSON object with the field {field}")
@@ -93,23 +93,23 @@ def get(record: Any, field: str, where: str) -> Any:
     return record[field]
 
 
-def integer(record: Any, field: str, where: str) -> int:
+def get_integer(record: Any, field: str, where: str) -> int:
     """An integer field."""
-    value = get(record, field, where)
+    value = get_field(record, field, where)
     if type(value) is not int or abs(value) >= 1 << 63:
-        raise BadInput(f"{where}, field {field}", found=brief(value), needed="an integer")
+        raise BadInput(f"{where}, field {field}", found=abbreviate(value), needed="an integer")
     return value
 
 
-def numbers(record: Any, field: str, count: int, where: str) -> Float[np.ndarray, " n"]:
+def get_numbers(record: Any, field: str, count: int, where: str) -> Float[np.ndarray, " n"]:
     """A field of ``count`` finite numbers."""
-    return vector(get(record, field, where), count, f"{where}, field {field}")
+    return parse_vector(get_field(record, field, where), count, f"{where}, field {field}")
 
 
-def vector(value: Any, count: int, where: str) -> Float[np.ndarray, " n"]:
+def parse_vector(value: Any, count: int, where: str) -> Float[np.ndarray, " n"]:
     """A JSON list of ``count`` finite numbers."""
     if not isinstance(value, list) or len(value) != count or not all(is_number(v) for v in value):
-        raise BadInput(where, found=brief(value), needed=f"{count} numbers")
+        raise BadInput(where, found=abbreviate(value), needed=f"{count} numbers")
     array = np.array(value, dtype=np.float64)
     if not np.isfinite(array).all():
         at = int(np.flatnonzero(~np.isfinite(array))[0])
@@ -122,7 +122,7 @@ def is_number(value: Any) -> bool:
     return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 63)
 
 
-def brief(value: Any, *, length: int = 60) -> str:
+def abbreviate(value: Any, *, length: int = 60) -> str:
     """A value as text of one short line; long lists say how many elements they have."""
     try:
         text = json.dumps(value)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.results import COLUMNS, ResultRow, name_parts, scan_results
+from pipeline.bop.results import COLUMNS, ResultRow, parse_results_name, scan_results
 
 ORTHONORMAL = 1e-3
 """A rotation further off (written with three decimals, say) is a note; off ROTATION_TOLERANCE it is a fault."""
@@ -19,7 +19,7 @@ _METRES_MM = 20.0  # a median distance below it is one in metres: no camera sees
 
 
 @dataclass(frozen=True)
-class Lint:
+class LintReport:
     """What a check found: ``faults`` make a submission invalid or wrong, ``warnings`` may be meant so."""
 
     rows: int
@@ -27,7 +27,7 @@ class Lint:
     warnings: tuple[str, ...]
 
 
-def lint(path: Path, data: Dataset | None) -> Lint:
+def lint(path: Path, data: Dataset | None) -> LintReport:
     """All faults of a csv: name, columns, numbers, rotations, units, times; with a dataset also ids and coverage.
 
     Raises BadInput for a file that cannot be read.
@@ -35,12 +35,12 @@ def lint(path: Path, data: Dataset | None) -> Lint:
     rows, broken = scan_results(path)
     faults = [str(fault) for fault in broken]
     warnings: list[str] = []
-    if name_parts(path) is None:
+    if parse_results_name(path) is None:
         needed = "<method>_<dataset>-<split>.csv, no underscore in the method's name"
         faults.insert(0, f"{path.name}: found another name, needs {needed}")
     if not rows:
         faults.append(f"{path}: found no estimate, needs rows of {','.join(COLUMNS)}")
-        return Lint(0, tuple(faults), ())
+        return LintReport(0, tuple(faults), ())
     faults += _units(path, rows)
     warnings += _precision(rows) + _times(rows)
     if data is not None:
@@ -48,7 +48,7 @@ def lint(path: Path, data: Dataset | None) -> Lint:
         faults, warnings = faults + more_faults, warnings + more_warnings
     else:
         warnings.append("ids and coverage of the targets were not checked: that needs --dataset")
-    return Lint(len(rows), tuple(faults), tuple(warnings))
+    return LintReport(len(rows), tuple(faults), tuple(warnings))
 
 
 def _units(path: Path, rows: Sequence[ResultRow]) -> list[str]:

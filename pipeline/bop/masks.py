@@ -9,13 +9,13 @@ from jaxtyping import Bool
 from pycocotools import mask as coco
 
 
-def encode(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
+def encode_rle(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
     """Compressed RLE {"size": [h, w], "counts": str} of a mask."""
     rle = coco.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": [int(n) for n in rle["size"]], "counts": rle["counts"].decode("ascii")}
 
 
-def decode(rle: dict[str, Any]) -> Bool[np.ndarray, "H W"]:
+def decode_rle(rle: dict[str, Any]) -> Bool[np.ndarray, "H W"]:
     """The mask of an RLE made by ``encode`` or ``read_rle``; others are not checked here."""
     return coco.decode(rle).astype(bool)
 
@@ -38,15 +38,15 @@ def read_rle(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
     h, w = size_hw
     if sum(runs) != h * w:
         raise ValueError(f"RLE counts cover {sum(runs)} pixels, the image has {h * w}")
-    return encode(_fill(runs, h, w))
+    return encode_rle(_fill(runs, h, w))
 
 
-def runs(rle: dict[str, Any]) -> dict[str, Any]:
+def to_uncompressed(rle: dict[str, Any]) -> dict[str, Any]:
     """An RLE made here with its counts as a list, as BOP's files have it."""
     return {"size": rle["size"], "counts": _uncompressed(rle["counts"])}
 
 
-def area(rle: dict[str, Any]) -> int:
+def rle_area(rle: dict[str, Any]) -> int:
     """Pixels inside the mask of an RLE made here."""
     return int(coco.area(rle))
 

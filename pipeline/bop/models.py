@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pipeline.bop.jsonio import brief, by_id, get, is_number, numbers, place, vector
-from pipeline.bop.scene import rotation_fault
+from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_numbers, is_number, parse_vector, read_by_id
+from pipeline.bop.scene import describe_rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.io.meshes import diameter_mm, read_mesh
@@ -35,7 +35,9 @@ def read_models_info(path: Path) -> dict[int, ModelInfo]:
     """Entries by object id; empty when there is no such file (diameters then come from the meshes)."""
     if not path.exists():
         return {}
-    return {obj_id: _model_info(record, place(path, object=obj_id)) for obj_id, record in by_id(path).items()}
+    return {
+        obj_id: _model_info(record, describe_place(path, object=obj_id)) for obj_id, record in read_by_id(path).items()
+    }
 
 
 def read_model(
@@ -64,7 +66,7 @@ def check_model_files(path: Path, obj_id: int, infos: dict[int, ModelInfo]) -> N
     if not path.exists():
         raise BadInput(path, found="no such file", needed=f"the mesh of object {obj_id}, which the targets ask for")
     if infos and obj_id not in infos:
-        where = place(path.parent / "models_info.json", object=obj_id)
+        where = describe_place(path.parent / "models_info.json", object=obj_id)
         raise BadInput(
             where, found=f"entries for {', '.join(map(str, sorted(infos)))}", needed="diameter of this object"
         )
@@ -106,15 +108,15 @@ def _unit_fault(diameter: float, distances_mm: Sequence[float]) -> str:
 
 
 def _model_info(record: Any, where: str) -> ModelInfo:
-    diameter = get(record, "diameter", where)
+    diameter = get_field(record, "diameter", where)
     if not (is_number(diameter) and np.isfinite(diameter) and diameter > 0):
-        raise BadInput(f"{where}, field diameter", found=brief(diameter), needed="a number > 0, in mm")
+        raise BadInput(f"{where}, field diameter", found=abbreviate(diameter), needed="a number > 0, in mm")
     given = enumerate(_list(record, "symmetries_discrete", where))
     discrete = [_discrete(value, f"{where}, symmetries_discrete {i}") for i, value in given]
     continuous = _list(record, "symmetries_continuous", where)
     inside = [f"{where}, symmetries_continuous {i}" for i in range(len(continuous))]
-    axes = [numbers(symmetry, "axis", 3, place_) for symmetry, place_ in zip(continuous, inside, strict=True)]
-    offsets = [numbers(symmetry, "offset", 3, place_) for symmetry, place_ in zip(continuous, inside, strict=True)]
+    axes = [get_numbers(symmetry, "axis", 3, place_) for symmetry, place_ in zip(continuous, inside, strict=True)]
+    offsets = [get_numbers(symmetry, "offset", 3, place_) for symmetry, place_ in zip(continuous, inside, strict=True)]
     for axis, place_ in zip(axes, inside, strict=True):
         if not axis.any():
             raise BadInput(f"{place_}, field axis", found="a zero vector", needed="a direction")
@@ -123,8 +125,10 @@ def _model_info(record: Any, where: str) -> ModelInfo:
 
 
 def _discrete(value: Any, where: str) -> Float[np.ndarray, "4 4"]:
-    T = vector(value, 16, where).reshape(4, 4)
-    fault = rotation_fault(T[:3, :3]) or ("" if np.allclose(T[3], [0, 0, 0, 1]) else f"a last row of {T[3].tolist()}")
+    T = parse_vector(value, 16, where).reshape(4, 4)
+    fault = describe_rotation_fault(T[:3, :3]) or (
+        "" if np.allclose(T[3], [0, 0, 0, 1]) else f"a last row of {T[3].tolist()}"
+    )
     if fault:
         raise BadInput(where, found=fault, needed="a rigid 4 x 4 matrix, row by row")
     return T
@@ -133,7 +137,7 @@ def _discrete(value: Any, where: str) -> Float[np.ndarray, "4 4"]:
 def _list(record: Any, field: str, where: str) -> list[Any]:
     value = record.get(field, [])
     if not isinstance(value, list):
-        raise BadInput(f"{where}, field {field}", found=brief(value), needed="a list")
+        raise BadInput(f"{where}, field {field}", found=abbreviate(value), needed="a list")
     return value
 
 
@@ -141,5 +145,5 @@ def _centre(record: Any, where: str) -> Float[np.ndarray, " 3"] | None:
     names = [f"{kind}_{axis}" for kind in ("min", "size") for axis in "xyz"]
     if not all(name in record for name in names):
         return None
-    low_and_size = vector([record[name] for name in names], 6, f"{where}, fields min_x to size_z")
+    low_and_size = parse_vector([record[name] for name in names], 6, f"{where}, fields min_x to size_z")
     return low_and_size[:3] + low_and_size[3:] / 2

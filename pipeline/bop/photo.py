@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.images import image_size, read_rgb
 from pipeline.bop.jsonio import is_number
-from pipeline.bop.scene import Box, check_K, edges
+from pipeline.bop.scene import Box, check_K, xyxy_from_xywh
 from pipeline.errors import BadInput
 from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
@@ -72,7 +72,7 @@ class PhotoConfig(Spec):
             mesh_paths=tuple(Path(mesh).expanduser() for mesh in meshes),
             camera_matrix=K,
             mask_file=None if self.mask is None else Path(self.mask).expanduser(),
-            bbox_xyxy=None if self.bbox is None else edges(self.bbox),
+            bbox_xyxy=None if self.bbox is None else xyxy_from_xywh(self.bbox),
             scale=self.scale,
         )
 
@@ -110,8 +110,8 @@ class Photo(Dataset):
     scale: float = 1.0
 
     @property
-    def told_where(self) -> str:
-        """As Dataset.told_where."""
+    def location_field(self) -> str:
+        """As Dataset.location_field."""
         return "dataset.mask" if self.mask_file else "dataset.bbox" if self.bbox_xyxy else ""
 
     @property

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.bop.scene import rotation_fault
+from pipeline.bop.scene import describe_rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.io.files import write_atomic
@@ -47,7 +47,7 @@ def results_name(method: str, dataset: str, split: str = "test") -> str:
     return f"{method}_{dataset}-{split.split('_')[0]}.csv"
 
 
-def name_parts(path: Path) -> tuple[str, str, str] | None:
+def parse_results_name(path: Path) -> tuple[str, str, str] | None:
     """(method, dataset, split) of ``<method>_<dataset>-<split>.csv``, None for another name.
 
     As BOP's tools read it: what follows the last part of the split, after a further underscore, is left out.
@@ -56,7 +56,7 @@ def name_parts(path: Path) -> tuple[str, str, str] | None:
     return (found[1], found[2], found[3]) if found and path.suffix == ".csv" else None
 
 
-def rows_of(
+def make_rows(
     estimates: Sequence[PoseEstimate], times_by_image: Mapping[tuple[int, int], float] | None = None
 ) -> list[ResultRow]:
     """Rows of estimates, sorted by scene, image and object, best score first.
@@ -133,7 +133,7 @@ def _row(line: str, where: str) -> ResultRow:
         _numbers(cell, count, f"{where}, field {name}")
         for name, cell, count in zip(COLUMNS[3:], cells[3:], (1, 9, 3, 1), strict=True)
     )
-    if fault := rotation_fault(R.reshape(3, 3)):
+    if fault := describe_rotation_fault(R.reshape(3, 3)):
         raise BadInput(f"{where}, field R", found=fault, needed="a rotation matrix, row by row")
     if time_s[0] < 0 and time_s[0] != -1:
         raise BadInput(f"{where}, field time", found=f"{time_s[0]:g}", needed="seconds >= 0, or -1 for unknown")

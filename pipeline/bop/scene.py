@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.bop.jsonio import brief, by_id, get, integer, is_number, numbers, place
+from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_integer, get_numbers, is_number, read_by_id
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 
@@ -57,18 +57,18 @@ class Scene:
     @cached_property
     def cameras(self) -> dict[int, Any]:
         """scene_camera.json by image, unchecked."""
-        return by_id(self.folder / "scene_camera.json")
+        return read_by_id(self.folder / "scene_camera.json")
 
     @cached_property
     def annotations(self) -> dict[int, Any]:
         """scene_gt.json by image, unchecked."""
-        return by_id(self.folder / "scene_gt.json")
+        return read_by_id(self.folder / "scene_gt.json")
 
     @cached_property
     def annotation_infos(self) -> dict[int, Any]:
         """scene_gt_info.json by image, unchecked; empty without the file."""
         path = self.folder / "scene_gt_info.json"
-        return by_id(path) if path.exists() else {}
+        return read_by_id(path) if path.exists() else {}
 
     def image_path(self, im_id: int) -> Path:
         """The photograph: rgb/ before gray/, png before jpg and tif."""
@@ -85,14 +85,14 @@ class Scene:
     def camera(self, im_id: int) -> Camera:
         """K and depth scale of one image."""
         path = self.folder / "scene_camera.json"
-        where = place(path, scene=self.scene_id, image=im_id)
+        where = describe_place(path, scene=self.scene_id, image=im_id)
         if im_id not in self.cameras:
             raise BadInput(where, found="no entry", needed="cam_K of this image")
         record = self.cameras[im_id]
         scale = record.get("depth_scale") if isinstance(record, dict) else None
         if scale is not None and not (is_number(scale) and np.isfinite(scale) and scale > 0):
-            raise BadInput(f"{where}, field depth_scale", found=brief(scale), needed="a number > 0")
-        K = numbers(record, "cam_K", 9, where).reshape(3, 3)
+            raise BadInput(f"{where}, field depth_scale", found=abbreviate(scale), needed="a number > 0")
+        K = get_numbers(record, "cam_K", 9, where).reshape(3, 3)
         return Camera(K, None if scale is None else float(scale))
 
     def ground_truth(self, im_id: int) -> list[GroundTruth]:
@@ -108,10 +108,10 @@ class Scene:
 
     def _parsed(self, im_id: int) -> list[GroundTruth]:
         path = self.folder / "scene_gt.json"
-        where = place(path, scene=self.scene_id, image=im_id)
+        where = describe_place(path, scene=self.scene_id, image=im_id)
         records = self.annotations.get(im_id)
         if not isinstance(records, list):
-            found = "no entry" if records is None else brief(records)
+            found = "no entry" if records is None else abbreviate(records)
             raise BadInput(where, found=found, needed="the list of annotated instances")
         infos = self._infos(im_id, len(records))
         pairs = enumerate(zip(records, infos, strict=True))
@@ -122,9 +122,13 @@ class Scene:
             return [None] * count
         infos = self.annotation_infos.get(im_id)
         if not isinstance(infos, list) or len(infos) != count:
-            where = place(self.folder / "scene_gt_info.json", scene=self.scene_id, image=im_id)
+            where = describe_place(self.folder / "scene_gt_info.json", scene=self.scene_id, image=im_id)
             found = (
-                "no entry" if infos is None else f"{len(infos)} entries" if isinstance(infos, list) else brief(infos)
+                "no entry"
+                if infos is None
+                else f"{len(infos)} entries"
+                if isinstance(infos, list)
+                else abbreviate(infos)
             )
             raise BadInput(where, found=found, needed=f"{count} entries, as many as scene_gt.json has")
         return infos
@@ -134,19 +138,19 @@ class Scene:
         for path in candidates:
             if path.exists():
                 return path
-        where = place(self.folder, scene=self.scene_id, image=im_id)
+        where = describe_place(self.folder, scene=self.scene_id, image=im_id)
         raise BadInput(
             where, found="no file", needed=f"{what} at one of {', '.join(p.format(im_id) for p in patterns)}"
         )
 
 
-def edges(bbox_xywh: Sequence[float]) -> Box:
+def xyxy_from_xywh(bbox_xywh: Sequence[float]) -> Box:
     """(x0, y0, x1, y1) of BOP's box (x, y, w, h), whose columns are x to x + w - 1."""
     x, y, w, h = bbox_xywh
     return x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5
 
 
-def rotation_fault(R: Float[np.ndarray, "3 3"]) -> str:
+def describe_rotation_fault(R: Float[np.ndarray, "3 3"]) -> str:
     """Why R is no rotation, "" when it is one within ROTATION_TOLERANCE."""
     off = float(np.abs(R @ R.T - np.eye(3)).max())
     if off > ROTATION_TOLERANCE:
@@ -176,24 +180,26 @@ def check_K(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], where: str) -
 
 
 def _instance(record: Any, info: Any, gt_id: int, where: str) -> GroundTruth:
-    R = numbers(record, "cam_R_m2c", 9, where).reshape(3, 3)
-    t = numbers(record, "cam_t_m2c", 3, where)
-    if fault := rotation_fault(R):
+    R = get_numbers(record, "cam_R_m2c", 9, where).reshape(3, 3)
+    t = get_numbers(record, "cam_t_m2c", 3, where)
+    if fault := describe_rotation_fault(R):
         raise BadInput(f"{where}, field cam_R_m2c", found=fault, needed="a rotation matrix, row by row")
     if t[2] <= 0:
         raise BadInput(
             f"{where}, field cam_t_m2c", found=f"z = {t[2]:g}", needed="an object in front of the camera, mm"
         )
-    pose = integer(record, "obj_id", where), rigid(R, t)
+    pose = get_integer(record, "obj_id", where), rigid(R, t)
     if info is None:
         return GroundTruth(gt_id, *pose)
     where = where.replace("scene_gt.json", "scene_gt_info.json")
-    visible = get(info, "visib_fract", where)
+    visible = get_field(info, "visib_fract", where)
     if not (is_number(visible) and 0 <= visible <= 1):
-        raise BadInput(f"{where}, field visib_fract", found=brief(visible), needed="a number from 0 to 1")
+        raise BadInput(f"{where}, field visib_fract", found=abbreviate(visible), needed="a number from 0 to 1")
     return GroundTruth(gt_id, *pose, float(visible), _box(info, "bbox_visib", where), _box(info, "bbox_obj", where))
 
 
 def _box(info: Any, field: str, where: str) -> Box | None:
-    box = numbers(info, field, 4, where).tolist()
-    return edges(box) if box[2] > 0 and box[3] > 0 else None  # BOP writes -1 -1 -1 -1 for an instance not in sight
+    box = get_numbers(info, field, 4, where).tolist()
+    return (
+        xyxy_from_xywh(box) if box[2] > 0 and box[3] > 0 else None
+    )  # BOP writes -1 -1 -1 -1 for an instance not in sight

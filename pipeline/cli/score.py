@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.lint import lint
-from pipeline.bop.results import ResultRow, name_parts, read_results
+from pipeline.bop.results import ResultRow, parse_results_name, read_results
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.digests import file_digest
 from pipeline.io.files import write_json
@@ -108,12 +108,12 @@ def _opened(asked: argparse.Namespace, path: Path) -> Scoreable:
     kept = _known(path, rows, data, subset=asked.subset)
     delta = VSD_DELTA_MM.get(data.name, 15.0)
     scorer = Scorer(data, data.targets, data.models, vsd_delta_mm=delta, with_vsd=not asked.no_vsd)
-    parts = name_parts(path)
+    parts = parse_results_name(path)
     return Scoreable(path, parts[0] if parts else path.stem, kept, scorer)
 
 
 def _open_dataset(asked: argparse.Namespace, path: Path, *, models: str | None) -> Dataset:
-    root, parts = Path(asked.dataset).expanduser(), name_parts(path)
+    root, parts = Path(asked.dataset).expanduser(), parse_results_name(path)
     split = asked.split or _split_folder(root, parts[2] if parts else "test")
     if models is None:
         models = "models_eval" if (root / "models_eval").is_dir() else "models"

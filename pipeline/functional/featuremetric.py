@@ -38,7 +38,7 @@ class FeatureField:
     directions: bool
 
     @classmethod
-    def of(
+    def from_map(
         cls, values: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, directions: bool = False
     ) -> FeatureField:
         """The field of a map."""
@@ -284,4 +284,4 @@ def build_level(
     inside = shown[query_mask]
     unseen = np.square(d).sum(1) + np.square(inside).sum(1).mean() - 2 * d @ inside.mean(0)
     surface = Surface(points_obj, d, np.maximum(unseen, 0).astype(np.float64))
-    return surface, FeatureField.of(shown, query_mask, directions=directions)
+    return surface, FeatureField.from_map(shown, query_mask, directions=directions)

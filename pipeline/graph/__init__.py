@@ -85,7 +85,7 @@ class Graph:
                     raise BadInput(asked[layer], found=fault.found, needed=needed) from None
                 raise
         if self.detections.proposals:
-            if where := self.run.dataset.told_where:
+            if where := self.run.dataset.location_field:
                 raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
             self.detections.proposals.check()
         self.templates.views = fit_to_budgets(self.run, self.detections.proposals)
@@ -157,5 +157,5 @@ class Graph:
         return list(self.planned())
 
     def planned(self) -> Iterator[Node]:
-        """The nodes of a plan one by one. Raises NotFetched where weights decide that are not here."""
+        """The nodes of a plan one by one. Raises NotDownloaded where weights decide that are not here."""
         return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()

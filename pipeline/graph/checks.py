@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.bop.masks import decode
+from pipeline.bop.masks import decode_rle
 from pipeline.graph.context import Context, ImageId
 from pipeline.items.views import Detection
 
@@ -47,7 +47,7 @@ def _doubt(run: Context, d: Detection) -> str:
             share = 1 - px / ((right - left) * (bottom - top))
             return f"{share:.0%} of the box lies outside the image; is it x, y, width, height, and not two corners?"
     else:
-        mask = decode(d.rle)
+        mask = decode_rle(d.rle)
         px, what = float(mask.sum()), "mask"
         round_all = all(side.any() for side in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
     if px < FEW_PX:

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.io.digests import files_digest
-from pipeline.items.records import detection_of, detection_record
+from pipeline.items.records import detection_from_record, detection_to_record
 from pipeline.items.views import Detection
 from pipeline.spec import digest
 from pipeline.stages.detect import DescribingDetector
@@ -56,14 +56,14 @@ class DetectionNodes:
         fresh = not self.run.store.is_complete(self.ref)
         if fresh:
             found = self._find()
-            self.run.store.put_document(self.ref, [detection_record(d) for d in found], rows=len(found))
-        found = [detection_of(record) for record in self.run.store.read(self.ref).document]
+            self.run.store.put_document(self.ref, [detection_to_record(d) for d in found], rows=len(found))
+        found = [detection_from_record(record) for record in self.run.store.read(self.ref).document]
         self.run.progress.add("detections", **{"computed" if fresh else "reused": len(found)})
         return found
 
     def identity(self, detection: Detection) -> dict[str, Any]:
         """What poses depend on: seconds that were measured here, other in every run, are no part of it."""
-        record = detection_record(detection)
+        record = detection_to_record(detection)
         return record | {"time_s": 0.0} if self.proposals else record
 
     def _find(self) -> list[Detection]:

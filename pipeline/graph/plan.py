@@ -12,7 +12,7 @@ from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.graph.timings import work_of
-from pipeline.io.checkpoints import NotFetched
+from pipeline.io.checkpoints import NotDownloaded
 from pipeline.store import Layout, Ref
 
 TEMPLATE_PIXEL_BYTES = 7  # rgb and float32 depth, before compression
@@ -50,13 +50,13 @@ class Plan:
     detections: DetectionNodes
 
     def nodes(self) -> Iterator[Node]:
-        """All nodes in the order of the route. Raises NotFetched at the first whose key weights decide."""
-        unknown: NotFetched | None = None
+        """All nodes in the order of the route. Raises NotDownloaded at the first whose key weights decide."""
+        unknown: NotDownloaded | None = None
         for obj_id in self.run.object_ids:
             yield from self._views_of_object(obj_id)
             try:
                 yield from self._features_of_object(obj_id)
-            except NotFetched as fault:
+            except NotDownloaded as fault:
                 unknown = fault
         if unknown is not None:
             raise unknown

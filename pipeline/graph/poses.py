@@ -14,7 +14,7 @@ from pipeline.graph.tasks import Advance, Work
 from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.graph.timings import work_of
 from pipeline.items.poses import NoEstimate, PoseEstimate
-from pipeline.items.records import Answer, answer_of, record_of
+from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
 from pipeline.route import ONLINE_STAGES, Query, Trace, Truth, template_pose, trace_pose
 from pipeline.spec import digest
@@ -75,7 +75,7 @@ class PoseNodes:
         ref = self.run_ref()
         if not self.run.store.is_complete(ref):
             self._make(ref)
-        answers = [answer_of(record) for record in self.run.store.read(ref).document["answers"]]
+        answers = [answer_from_record(record) for record in self.run.store.read(ref).document["answers"]]
         self._count_reused(len(answers))
         return answers
 
@@ -114,7 +114,7 @@ class PoseNodes:
             answers += self._answers(target, bank)
             advance(1)
         seconds = sum(sum(a.times_s.values()) for a in answers if isinstance(a, PoseEstimate))
-        document = {"answers": [record_of(answer) for answer in answers]}
+        document = {"answers": [answer_to_record(answer) for answer in answers]}
         self.run.store.put_document(ref, document, rows=len(answers), time_s=seconds)
         self.run.progress.add("poses", computed=len(answers), time_s=seconds)
         templates = self.run.store.read(self.templates.templates(obj_id)).rows

@@ -11,14 +11,14 @@ from typing import cast
 import torch
 from jaxtyping import Float
 
-from pipeline.bop.masks import decode
+from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.descriptors import pool_foreground
 from pipeline.graph.context import Context, ImageId, stacked
 from pipeline.graph.tasks import Advance, Work
 from pipeline.graph.templates import TemplateNodes
 from pipeline.io.digests import file_digest
-from pipeline.items.records import proposal_of, proposal_record
+from pipeline.items.records import proposal_from_record, proposal_to_record
 from pipeline.items.views import Crops, Proposal
 from pipeline.spec import digest
 from pipeline.stages.detect import DescribingDetector
@@ -129,7 +129,7 @@ class ProposalNodes:
     def described(self, image: ImageId) -> tuple[list[Proposal], Float[torch.Tensor, "p c"]]:
         """An image's proposals that have a crop, and one vector for each."""
         kept = self.run.store.read(self.crops(image)).document["kept"]
-        proposals = [proposal_of(record) for record in self.run.store.read(self.proposals(image)).document]
+        proposals = [proposal_from_record(record) for record in self.run.store.read(self.proposals(image)).document]
         if not kept:
             channels = self.run.stages.extract.feature_shape(self.detector.describe_layer)[0]
             return [], torch.zeros((0, channels), device=self.run.device)
@@ -149,12 +149,12 @@ class ProposalNodes:
             start = time.perf_counter()
             found = propose(self.run.dataset.image(*image))
             seconds = time.perf_counter() - start
-            records = [proposal_record(proposal) for proposal in found]
+            records = [proposal_to_record(proposal) for proposal in found]
             self.run.store.put_document(ref, records, rows=len(found), time_s=seconds)
         entry = self.run.store.read(ref)
         counted = {"computed" if fresh else "reused": entry.rows}
         self.run.progress.add("proposals", **counted, time_s=entry.time_s if fresh else 0.0)
-        return [proposal_of(record) for record in entry.document]
+        return [proposal_from_record(record) for record in entry.document]
 
     def _make_crops(self, image: ImageId, proposals: Sequence[Proposal]) -> int:
         """Crop an image's proposals; returns how many could be cropped."""
@@ -166,7 +166,7 @@ class ProposalNodes:
         crops, kept = [], []
         for position, proposal in enumerate(proposals):
             try:
-                crops.append(self.run.stages.crop(photo.rgb, decode(proposal.rle), proposal.bbox_xyxy, photo.K))
+                crops.append(self.run.stages.crop(photo.rgb, decode_rle(proposal.rle), proposal.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose:
                 continue  # it cannot be an object that a pose could be found of

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from pipeline.bop.masks import decode
+from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.graph.context import Context, ImageId, stacked
@@ -128,7 +128,7 @@ class QueryNodes:
         crops, kept, failed = [], [], {}
         for position, (_, detection) in enumerate(usable):
             try:
-                mask = None if detection.rle is None else decode(detection.rle)
+                mask = None if detection.rle is None else decode_rle(detection.rle)
                 crops.append(self.run.stages.crop(photo.rgb, mask, detection.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose as failure:

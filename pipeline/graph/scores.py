@@ -20,7 +20,14 @@ from pipeline.graph.templates import TemplateNodes
 from pipeline.io.digests import files_digest
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
-from pipeline.items.scores import PoseErrors, TemplateError, errors_of, errors_record, scores_of, scores_record
+from pipeline.items.scores import (
+    PoseErrors,
+    TemplateError,
+    errors_from_record,
+    errors_to_record,
+    scores_from_record,
+    scores_to_record,
+)
 from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
 from pipeline.scoring import SCORES_VERSION, Scorer, ScoringResult, truth_digest
@@ -94,10 +101,10 @@ class ScoreNodes:
         entry = self.run.store.read(self.ref)
         seconds = entry.time_s if fresh else 0.0
         self.run.progress.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
-        errors = tuple(errors_of(record) for record in entry.document["errors"])
+        errors = tuple(errors_from_record(record) for record in entry.document["errors"])
         templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
         return Judged(
-            ScoringResult(errors, scores_of(entry.document["scores"]), self.scorer.models),
+            ScoringResult(errors, scores_from_record(entry.document["scores"]), self.scorer.models),
             _by_answer(answers, errors),
             templates,
             {(s, i, o, g): error for s, i, o, g, error in entry.document.get("correspondences", [])},
@@ -114,8 +121,8 @@ class ScoreNodes:
             if (instance := _instance(answer, errors)) and (error := self._template_error(answer, instance))
         }
         document: dict[str, Any] = {
-            "errors": [errors_record(errors) for errors in scored.errors],
-            "scores": scores_record(scored.scores),
+            "errors": [errors_to_record(errors) for errors in scored.errors],
+            "scores": scores_to_record(scored.scores),
             "templates": [[*instance, *asdict(error).values()] for instance, error in angles.items()],
         }
         if self.retrace:

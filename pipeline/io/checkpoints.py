@@ -15,12 +15,12 @@ PICKLES = (".bin", ".ckpt", ".pt", ".pth")
 _offline: ContextVar[bool] = ContextVar("offline", default=False)
 
 
-def everywhere(name: str) -> str:
+def sweep_hint(name: str) -> str:
     """How weights are named once for all methods, as sweeps want it."""
     return f" (weights.{name}=FOLDER: for all methods)"
 
 
-class NotFetched(BadInput):
+class NotDownloaded(BadInput):
     """Weights of a hub id that are not here, while nothing is to be fetched."""
 
 
@@ -43,10 +43,10 @@ def is_local(weights: str) -> bool:
     )
 
 
-def fetched(hub_id: str, revision: str | None, patterns: Sequence[str], *, field: str, name: str) -> Path:
+def fetch_snapshot(hub_id: str, revision: str | None, patterns: Sequence[str], *, field: str, name: str) -> Path:
     """Local folder of the hub's files that match ``patterns``.
 
-    Raises BadInput naming ``field`` and what ``name`` is set by for all methods; NotFetched where ``offline`` rules.
+    Raises BadInput naming ``field`` and what ``name`` is set by for all methods; NotDownloaded where ``offline`` rules.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
@@ -62,16 +62,16 @@ def fetched(hub_id: str, revision: str | None, patterns: Sequence[str], *, field
     except LocalEntryNotFoundError as error:
         if here:
             found = f"{hub_id!r}, a hub id that was not fetched yet: its revision is not known offline"
-            raise NotFetched(field, found=found, needed="a run, which fetches it, or a local folder") from None
-        told = one_line(error)
+            raise NotDownloaded(field, found=found, needed="a run, which fetches it, or a local folder") from None
+        told = first_line(error)
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        told = one_line(error)
+        told = first_line(error)
     found = f"{hub_id!r}, which is no local path and was not fetched: {told.removeprefix('Got: ')}"
-    needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder" + everywhere(name)
+    needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder" + sweep_hint(name)
     raise BadInput(field, found=found, needed=needed)
 
 
-def shards(index: Path) -> list[Path]:
+def list_shards(index: Path) -> list[Path]:
     """The files that an index of sharded weights names. Raises BadInput."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict) or not weight_map:
@@ -79,7 +79,7 @@ def shards(index: Path) -> list[Path]:
     return sorted({index.parent / str(name) for name in weight_map.values()})
 
 
-def pickled_in(folder: Path) -> list[str]:
+def list_pickles(folder: Path) -> list[str]:
     """Names of the files that would have to be unpickled."""
     return sorted(path.name for path in folder.glob("*") if path.suffix in PICKLES)
 
@@ -92,7 +92,7 @@ def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
         with safe_open(str(path), framework="pt") as tensors:
             return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise BadInput(path, found=one_line(error), needed="a complete safetensors file") from None
+        raise BadInput(path, found=first_line(error), needed="a complete safetensors file") from None
 
 
 def check_missing(names: Sequence[str], where: Path) -> None:
@@ -106,13 +106,13 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise BadInput(path, found=one_line(error), needed="valid JSON") from None
+        raise BadInput(path, found=first_line(error), needed="valid JSON") from None
     if not isinstance(value, dict):
         raise BadInput(path, found=type(value).__name__, needed="a JSON object")
     return value
 
 
-def one_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
     """The first line of an error's text, for a BadInput."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0][:200]

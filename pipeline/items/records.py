@@ -14,7 +14,7 @@ from pipeline.items.views import Detection, Proposal
 Answer = PoseEstimate | NoEstimate
 
 
-def record_of(answer: Answer) -> dict[str, Any]:
+def answer_to_record(answer: Answer) -> dict[str, Any]:
     """A JSON-able record; ``status`` is "estimate" or "none"."""
     if isinstance(answer, NoEstimate):
         return {"status": "none", **asdict(answer)}
@@ -25,7 +25,7 @@ def record_of(answer: Answer) -> dict[str, Any]:
     return {"status": "estimate", **values}
 
 
-def answer_of(record: Mapping[str, Any]) -> Answer:
+def answer_from_record(record: Mapping[str, Any]) -> Answer:
     """The answer a record holds."""
     values = {name: value for name, value in record.items() if name != "status"}
     if record["status"] == "none":
@@ -35,23 +35,23 @@ def answer_of(record: Mapping[str, Any]) -> Answer:
     return PoseEstimate(**values)
 
 
-def detection_record(detection: Detection) -> dict[str, Any]:
+def detection_to_record(detection: Detection) -> dict[str, Any]:
     """A JSON-able record of a detection."""
     return asdict(detection) | {"bbox_xyxy": list(detection.bbox_xyxy)}
 
 
-def detection_of(record: Mapping[str, Any]) -> Detection:
+def detection_from_record(record: Mapping[str, Any]) -> Detection:
     """The detection a record holds."""
     x0, y0, x1, y1 = record["bbox_xyxy"]
     return Detection(**{**record, "bbox_xyxy": (x0, y0, x1, y1)})
 
 
-def proposal_record(proposal: Proposal) -> dict[str, Any]:
+def proposal_to_record(proposal: Proposal) -> dict[str, Any]:
     """A JSON-able record of a proposal."""
     return asdict(proposal) | {"bbox_xyxy": list(proposal.bbox_xyxy)}
 
 
-def proposal_of(record: Mapping[str, Any]) -> Proposal:
+def proposal_from_record(record: Mapping[str, Any]) -> Proposal:
     """The proposal a record holds."""
     x0, y0, x1, y1 = record["bbox_xyxy"]
     return Proposal(**{**record, "bbox_xyxy": (x0, y0, x1, y1)})

@@ -46,7 +46,7 @@ class Scores:
     def __len__(self) -> int:
         return len(self.obj_id)
 
-    def of(self, chosen: Bool[np.ndarray, " n"]) -> Scores:
+    def select(self, chosen: Bool[np.ndarray, " n"]) -> Scores:
         """The scores of some instances."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "no_vsd"}
         kept: dict[str, Any] = {name: None if v is None else v[chosen] for name, v in arrays.items()}
@@ -102,7 +102,7 @@ class TemplateError:
     vectorised: float
 
 
-def scores_record(scores: Scores) -> dict[str, Any]:
+def scores_to_record(scores: Scores) -> dict[str, Any]:
     """JSON-able; hits are bits, in hexadecimal."""
     visible = [None if np.isnan(v) else round(float(v), 6) for v in scores.visib_fract]
     return {
@@ -115,7 +115,7 @@ def scores_record(scores: Scores) -> dict[str, Any]:
     }
 
 
-def scores_of(record: Mapping[str, Any]) -> Scores:
+def scores_from_record(record: Mapping[str, Any]) -> Scores:
     """The scores a record holds."""
     scene_id, im_id, obj_id, gt_id = np.array(record["instances"], dtype=np.int64).reshape(-1, 4).T
     visible = np.array([np.nan if v is None else v for v in record["visib_fract"]], dtype=np.float64)
@@ -126,13 +126,13 @@ def scores_of(record: Mapping[str, Any]) -> Scores:
     return Scores(scene_id, im_id, obj_id, gt_id, visible, mssd, mspd, vsd, record["no_vsd"])
 
 
-def errors_record(errors: PoseErrors) -> dict[str, Any]:
+def errors_to_record(errors: PoseErrors) -> dict[str, Any]:
     """JSON-able; what is infinitely far becomes null."""
     values = asdict(errors) | {"vsd": None if errors.vsd is None else list(errors.vsd)}
     return {n: None if isinstance(v, float) and not np.isfinite(v) else v for n, v in values.items()}
 
 
-def errors_of(record: Mapping[str, Any]) -> PoseErrors:
+def errors_from_record(record: Mapping[str, Any]) -> PoseErrors:
     """The errors a record holds."""
     values: dict[str, Any] = {name: np.inf if value is None else value for name, value in record.items()}
     values["vsd"] = None if record["vsd"] is None else tuple(record["vsd"])

@@ -21,7 +21,7 @@ class Interval:
     high: float
 
     @property
-    def apart_from_zero(self) -> bool:
+    def excludes_zero(self) -> bool:
         """Whether the interval leaves out 0: for a difference, whether it is more than chance."""
         return self.low > 0 or self.high < 0
 

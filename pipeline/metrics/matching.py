@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 
-def best_scored(scores: Sequence[float], count: int) -> list[int]:
+def select_best_scored(scores: Sequence[float], count: int) -> list[int]:
     """Indices of the ``count`` estimates with the highest scores, best first; equals keep their order; 0: all."""
     order = sorted(range(len(scores)), key=lambda i: -scores[i])
     return order[:count] if count else order
 
 
-def match(errors: Float[np.ndarray, "e g"], threshold: float) -> list[tuple[int, int]]:
+def match_instances(errors: Float[np.ndarray, "e g"], threshold: float) -> list[tuple[int, int]]:
     """Pairs (estimate, instance) of the greedy matching: estimates, best score first, each take the nearest instance.
 
     Only instances that are still free and whose error is below ``threshold`` can be taken; of equals, the first.

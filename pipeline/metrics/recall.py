@@ -69,18 +69,20 @@ def recall_by_threshold(scores: Scores) -> dict[str, Float[np.ndarray, " 10"]]:
     return {name: found.mean(axis=0) if len(found) else np.zeros(10) for name, found in by_metric.items()}
 
 
-def by_object(scores: Scores, *, theta_max: float = 0.5) -> dict[int, AverageRecall]:
+def recall_by_object(scores: Scores, *, theta_max: float = 0.5) -> dict[int, AverageRecall]:
     """Average recalls of each object."""
     objects = np.unique(scores.obj_id).tolist()
-    return {obj_id: average_recall(scores.of(scores.obj_id == obj_id), theta_max=theta_max) for obj_id in objects}
+    return {obj_id: average_recall(scores.select(scores.obj_id == obj_id), theta_max=theta_max) for obj_id in objects}
 
 
-def by_visibility(scores: Scores, *, theta_max: float = 0.5) -> dict[tuple[float, float], tuple[int, AverageRecall]]:
+def recall_by_visibility(
+    scores: Scores, *, theta_max: float = 0.5
+) -> dict[tuple[float, float], tuple[int, AverageRecall]]:
     """Instances and average recalls by visible fraction; bins without an instance are left out."""
     bins: dict[tuple[float, float], tuple[int, AverageRecall]] = {}
     for low, high in VISIBILITY_BINS:
         below = scores.visib_fract <= high if high == VISIBILITY_BINS[-1][1] else scores.visib_fract < high
         chosen = (scores.visib_fract >= low) & below
         if chosen.any():
-            bins[low, high] = int(chosen.sum()), average_recall(scores.of(chosen), theta_max=theta_max)
+            bins[low, high] = int(chosen.sum()), average_recall(scores.select(chosen), theta_max=theta_max)
     return bins

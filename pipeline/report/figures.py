@@ -18,7 +18,7 @@ from matplotlib.figure import Figure as Canvas
 
 from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
-from pipeline.metrics.recall import MSPD_PX, THETAS, by_visibility, instance_ar, recall_by_threshold
+from pipeline.metrics.recall import MSPD_PX, THETAS, instance_ar, recall_by_threshold, recall_by_visibility
 from pipeline.report import published
 from pipeline.report.families import Family
 from pipeline.report.run_records import RunRecord
@@ -135,7 +135,7 @@ def _objects_figure(rows: Mapping[str, RunRecord], dataset: str, objects: Sequen
     width = 0.8 / bars
     for k, (name, row) in enumerate(rows.items()):
         scores = _scores(row)
-        spread = [ar_interval(scores.of(scores.obj_id == obj_id)) for obj_id in objects]
+        spread = [ar_interval(scores.select(scores.obj_id == obj_id)) for obj_id in objects]
         place = np.arange(len(objects)) + (k - (bars - 1) / 2) * width
         axes.bar(place, [i.mean for i in spread], width * 0.92, color=COLOURS[k % len(COLOURS)], label=_wrapped(name))
         axes.errorbar(place, [i.mean for i in spread], _whiskers(spread), fmt="none", ecolor="#40464f", elinewidth=0.8)
@@ -187,7 +187,7 @@ def thresholds_figure(row: RunRecord) -> Figure:
 def visibility_figure(row: RunRecord) -> Figure | None:
     """Recall by visible fraction; None where the dataset does not say it."""
     scores = _scores(row)
-    bins = by_visibility(scores)
+    bins = recall_by_visibility(scores)
     if not bins:
         return None
     canvas, axes = _canvas()

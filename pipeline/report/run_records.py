@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pipeline.errors import BadInput
 from pipeline.io.files import write_json
-from pipeline.items.scores import DatasetId, Scores, TemplateError, scores_of, scores_record
+from pipeline.items.scores import DatasetId, Scores, TemplateError, scores_from_record, scores_to_record
 from pipeline.spec import digest
 
 FORMAT = 1
@@ -168,7 +168,7 @@ def _to_json(record: RunRecord) -> dict[str, Any]:
     content = {f.name: getattr(record, f.name) for f in fields(record) if f.name not in ("scores", "templates")}
     content["dataset"] = record.dataset and asdict(record.dataset)
     content["cases"] = [asdict(case) for case in record.cases]
-    content["scores"] = None if record.scores is None else scores_record(record.scores)
+    content["scores"] = None if record.scores is None else scores_to_record(record.scores)
     content["templates"] = [[*instance, *asdict(error).values()] for instance, error in record.templates.items()]
     return content
 
@@ -207,7 +207,7 @@ def _from_json(content: dict[str, Any]) -> RunRecord:
         **content,
         dataset=dataset and DatasetId(**{**dataset, "objects": tuple(dataset["objects"])}),
         cases=cases,
-        scores=None if scores is None else scores_of(scores),
+        scores=None if scores is None else scores_from_record(scores),
         templates=templates,
         failures=failures,
     )

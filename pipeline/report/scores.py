@@ -12,10 +12,10 @@ from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
 from pipeline.metrics.recall import (
     AverageRecall,
     average_recall,
-    by_object,
-    by_visibility,
     instance_recalls,
+    recall_by_object,
     recall_by_threshold,
+    recall_by_visibility,
 )
 from pipeline.scoring import ScoringResult
 
@@ -33,9 +33,9 @@ def scores_table(scored: ScoringResult, *, theta_max: float = 0.5) -> str:
     for name in ("AR", "AR_VSD", "AR_MSSD", "AR_MSPD"):
         if name in spread:
             lines.append(f"  {name} 95 % interval over images: {spread[name].low:.3f} to {spread[name].high:.3f}")
-    for obj_id, mine in by_object(scores, theta_max=theta_max).items():
+    for obj_id, mine in recall_by_object(scores, theta_max=theta_max).items():
         lines.append(_line(f"object {obj_id}", mine, f"{int((scores.obj_id == obj_id).sum())} instances"))
-    for (low, high), (count, mine) in by_visibility(scores, theta_max=theta_max).items():
+    for (low, high), (count, mine) in recall_by_visibility(scores, theta_max=theta_max).items():
         lines.append(_line("visible", mine, f"{low:.0%} to {high:.0%}, {count} instances"))
     lines.append(f"errors on the meshes of {scored.models}")
     if scores.no_vsd:
@@ -64,10 +64,12 @@ def summary_of(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, An
         "no_vsd": scores.no_vsd,
         "instances": len(scores),
         "intervals_95": {name: [i.low, i.high] for name, i in intervals(scored, theta_max=theta_max).items()},
-        "objects": {str(obj_id): metrics_of(mine) for obj_id, mine in by_object(scores, theta_max=theta_max).items()},
+        "objects": {
+            str(obj_id): metrics_of(mine) for obj_id, mine in recall_by_object(scores, theta_max=theta_max).items()
+        },
         "visibility": [
             {"from": low, "to": high, "instances": count, **metrics_of(mine)}
-            for (low, high), (count, mine) in by_visibility(scores, theta_max=theta_max).items()
+            for (low, high), (count, mine) in recall_by_visibility(scores, theta_max=theta_max).items()
         ],
         "recall_by_threshold": {name: found.tolist() for name, found in recall_by_threshold(scores).items()},
     }

@@ -278,7 +278,7 @@ def signed(value: Interval | None) -> str:
     """A difference with its interval, and a star when it is more than chance."""
     if value is None:
         return NONE
-    star = " *" if value.apart_from_zero else ""
+    star = " *" if value.excludes_zero else ""
     return f"{value.mean:+.3f} ({value.low:+.3f} to {value.high:+.3f}){star}"
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.bop.results import ResultRow, read_results, results_name, rows_of, write_results
+from pipeline.bop.results import ResultRow, make_rows, read_results, results_name, write_results
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.items.poses import PoseEstimate
@@ -44,7 +44,7 @@ def test_file_is_what_bop_asks_for(tmp_path: Path):
 
 def test_rows_of_one_image_share_its_time_and_are_sorted():
     estimates = [estimate(2, 7, 5, 0.1), estimate(2, 7, 5, 0.9), estimate(1, 7, 5, 0.3), estimate(2, 7, 1, 0.2)]
-    rows = rows_of(estimates, {(2, 7): 1.25})
+    rows = make_rows(estimates, {(2, 7): 1.25})
     assert [(r.scene_id, r.obj_id, r.score, r.time_s) for r in rows] == [
         (1, 5, 0.3, -1.0),
         (2, 1, 0.2, 1.25),

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pycocotools import mask as coco
 
-from pipeline.bop.masks import area, decode, encode, read_rle, runs
+from pipeline.bop.masks import decode_rle, encode_rle, read_rle, rle_area, to_uncompressed
 
 
 def uncompressed(mask: np.ndarray) -> list[int]:
@@ -24,20 +24,20 @@ def uncompressed(mask: np.ndarray) -> list[int]:
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**81 - 1))
 def test_every_way_to_write_a_mask_reads_the_same(h: int, w: int, bits: int):
     mask = np.array([bits >> i & 1 for i in range(h * w)], dtype=bool).reshape(h, w)
-    compressed = encode(mask)
+    compressed = encode_rle(mask)
     as_list = {"size": [h, w], "counts": uncompressed(mask)}
     padded = {"size": [h, w], "counts": [*as_list["counts"], 0, 0]}
     for given_rle in (compressed, as_list, padded):
         assert read_rle(given_rle, (h, w)) == compressed
-    np.testing.assert_array_equal(decode(compressed), mask)
-    assert runs(compressed) == as_list
-    assert area(compressed) == mask.sum()
+    np.testing.assert_array_equal(decode_rle(compressed), mask)
+    assert to_uncompressed(compressed) == as_list
+    assert rle_area(compressed) == mask.sum()
 
 
 def test_long_runs_survive_compression():
     mask = np.zeros((480, 640), dtype=bool)
     mask[100:300, 200:500] = True  # runs of 96100, 200 and 280 need one to four characters
-    assert read_rle(encode(mask), (480, 640)) == encode(mask)
+    assert read_rle(encode_rle(mask), (480, 640)) == encode_rle(mask)
 
 
 def test_masks_of_the_reference_library_read_the_same():

@@ -25,7 +25,7 @@ def scene(*, directions: bool) -> tuple[Surface, FeatureField]:
     rng = np.random.default_rng(0)
     points, d = rng.uniform(-40, 40, (60, 3)), rng.normal(size=(60, C)).astype(np.float32)
     d = featuremetric.l2_normalize(d) if directions else d
-    field = FeatureField.of(smooth_map(1), np.ones((H, W), bool), directions=directions)
+    field = FeatureField.from_map(smooth_map(1), np.ones((H, W), bool), directions=directions)
     return Surface(points, d, np.full(60, 2.0)), field
 
 
@@ -64,7 +64,7 @@ def test_gradient_of_the_cost_is_that_of_finite_differences(alpha, directions):
 
 def test_a_map_that_is_linear_in_place_is_read_exactly():
     y, x = np.mgrid[:H, :W].astype(np.float32)
-    field = FeatureField.of(np.stack([x, 2 * y, x - y], axis=-1), np.ones((H, W), bool))
+    field = FeatureField.from_map(np.stack([x, 2 * y, x - y], axis=-1), np.ones((H, W), bool))
     xy = np.random.default_rng(0).uniform(0, (W - 1, H - 1), (50, 2))
     true = np.stack([xy[:, 0], 2 * xy[:, 1], xy[:, 0] - xy[:, 1]], axis=1)
     asked = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)

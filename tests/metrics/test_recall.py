@@ -1,9 +1,15 @@
 import numpy as np
 import pytest
 
-from pipeline.items.scores import Scores, scores_of, scores_record
+from pipeline.items.scores import Scores, scores_from_record, scores_to_record
 from pipeline.metrics.bootstrap import image_index, mean_interval, paired_interval
-from pipeline.metrics.recall import average_recall, by_object, by_visibility, instance_ar, recall_by_threshold
+from pipeline.metrics.recall import (
+    average_recall,
+    instance_ar,
+    recall_by_object,
+    recall_by_threshold,
+    recall_by_visibility,
+)
 
 
 def scores(count: int = 12, *, vsd: bool = True, seed: int = 0) -> Scores:
@@ -42,20 +48,20 @@ def test_a_lower_bound_of_theta_leaves_out_the_thresholds_above_it():
 
 def test_objects_and_bins_of_visibility_cover_every_instance_once():
     given = scores()
-    objects = by_object(given)
+    objects = recall_by_object(given)
     assert set(objects) == {1, 2, 3}
     assert np.mean([recall.mssd for recall in objects.values()]) == pytest.approx(given.mssd.mean())
-    bins = by_visibility(given)
+    bins = recall_by_visibility(given)
     assert sum(count for count, _ in bins.values()) == len(given)
-    whole = given.of(np.arange(len(given)) < 1)
+    whole = given.select(np.arange(len(given)) < 1)
     whole.visib_fract[:] = 1.0
-    assert list(by_visibility(whole)) == [(0.8, 1.0)]
+    assert list(recall_by_visibility(whole)) == [(0.8, 1.0)]
 
 
 def test_scores_read_back_as_they_were_written():
     for given in (scores(), scores(vsd=False), scores(0)):
         given.visib_fract[:1] = np.nan
-        back = scores_of(scores_record(given))
+        back = scores_from_record(scores_to_record(given))
         for name in ("scene_id", "im_id", "obj_id", "gt_id", "mssd", "mspd", "vsd"):
             np.testing.assert_array_equal(getattr(back, name), getattr(given, name))
         np.testing.assert_allclose(back.visib_fract, given.visib_fract, atol=1e-6)
@@ -86,9 +92,9 @@ def test_a_paired_difference_sees_what_two_intervals_do_not():
     better = hard + 0.02
     assert mean_interval(hard, image).high > mean_interval(better, image).low
     difference = paired_interval(better, hard, image)
-    assert difference.apart_from_zero
+    assert difference.excludes_zero
     assert difference.mean == pytest.approx(0.02)
-    assert not paired_interval(hard, hard, image).apart_from_zero
+    assert not paired_interval(hard, hard, image).excludes_zero
 
 
 def test_images_of_two_scenes_with_one_number_are_two_images():

@@ -11,7 +11,7 @@ import pytest
 from pipeline.bop.models import read_models_info
 from pipeline.functional.rigid import rigid
 from pipeline.io.meshes import read_mesh
-from pipeline.metrics.matching import best_scored, match
+from pipeline.metrics.matching import match_instances, select_best_scored
 from pipeline.metrics.pose_error import add, adi, hull_vertices, mspd, mssd, rotation_error_deg, translation_error_mm
 from pipeline.metrics.vsd import vsd
 from pipeline.stages.render.raycast import render_depth
@@ -103,7 +103,7 @@ def test_matches_are_those_of_bop_toolkit(bop_reference):
     assert len(cases) == 40
     for case in cases:
         estimates = case["estimates"]
-        order = best_scored([e["score"] for e in estimates], case["max_estimates"])
+        order = select_best_scored([e["score"] for e in estimates], case["max_estimates"])
         errors = np.array([estimates[i]["errors"] for i in order]).reshape(len(order), case["gt_count"])
-        found = [[order[est], gt] for est, gt in match(errors, case["threshold"])]
+        found = [[order[est], gt] for est, gt in match_instances(errors, case["threshold"])]
         assert sorted(found) == sorted(case["matches"])

@@ -11,7 +11,7 @@ from PIL import Image
 from tiny_bop import SIZE_HW, edit_json, rectangle, write_json, write_tiny_bop
 
 from pipeline.bop.dataset import Dataset, open_dataset
-from pipeline.bop.masks import decode
+from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Detection, Target
@@ -80,7 +80,7 @@ def test_ways_to_write_a_detection_read_the_same(tiny: Dataset, tmp_path: Path):
         assert Json(path=str(tmp_path / name))(tiny, tiny.targets) == [plain]
     mask = np.zeros(SIZE_HW, dtype=bool)
     mask[5:25, 10:14] = True
-    np.testing.assert_array_equal(decode(plain.rle), mask)
+    np.testing.assert_array_equal(decode_rle(plain.rle), mask)
     assert plain.bbox_xyxy == (9.5, 4.5, 13.5, 24.5) == mask_bbox(mask)
     assert (plain.score, plain.time_s, plain.gt_id, plain.defect) == (0.5, 0.2, None, None)
 
@@ -99,8 +99,8 @@ def test_ground_truth_masks_are_those_of_the_files(tiny: Dataset):
     detections = GtMask()(tiny, tiny.targets)
     assert [(d.im_id, d.obj_id, d.gt_id) for d in detections] == [(0, 1, 1), (0, 1, 0), (0, 2, 2), (3, 2, 0)]
     for d in detections:
-        np.testing.assert_array_equal(decode(d.rle), tiny.mask(7, d.im_id, d.gt_id))
-        assert d.bbox_xyxy == mask_bbox(decode(d.rle))
+        np.testing.assert_array_equal(decode_rle(d.rle), tiny.mask(7, d.im_id, d.gt_id))
+        assert d.bbox_xyxy == mask_bbox(decode_rle(d.rle))
         assert (d.score, d.defect) == (1.0, None)
 
 
@@ -268,7 +268,7 @@ def test_sam_detections_of_lmo_read_whole(bop_mini: Path):
     assert len(detections) == 268  # the file has 10 more, of objects that the targets do not ask for
     assert [d for d in detections if d.defect] == []
     for d in detections[:20]:
-        assert d.bbox_xyxy == mask_bbox(decode(d.rle))
+        assert d.bbox_xyxy == mask_bbox(decode_rle(d.rle))
 
 
 def test_visible_masks_of_lmo_answer_all_targets(bop_mini: Path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.bop.masks import encode
+from pipeline.bop.masks import encode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.features import CLASS_TOKEN_LAYER
@@ -32,7 +32,7 @@ def proposal(x: int, y: int = 0, side: int = 10) -> Proposal:
     mask[y : y + side, x : x + side] = True
     box = mask_bbox(mask)
     assert box is not None
-    return Proposal(box, encode(mask), 0.9)
+    return Proposal(box, encode_rle(mask), 0.9)
 
 
 def like(**cosines: float) -> torch.Tensor:

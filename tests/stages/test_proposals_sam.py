@@ -14,7 +14,7 @@ from pycocotools import mask as coco
 from safetensors.torch import load_file, save_file
 from transformers import Sam2Model, SamModel
 
-from pipeline.bop.masks import decode
+from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Image, Proposal
@@ -89,7 +89,9 @@ def test_proposals_are_those_of_a_plain_loop_through_the_library(folder: Path):
     assert len(ours) == len(expected) > 3
     np.testing.assert_allclose([p.confidence for p in ours], [iou for _, iou, _ in expected], atol=1e-4)
     # a logit beside 0 may fall on either side, and of equal confidence two masks may change places
-    assert np.median([(decode(p.rle) == mask).mean() for p, (mask, _, _) in zip(ours, expected, strict=True)]) > 0.999
+    assert (
+        np.median([(decode_rle(p.rle) == mask).mean() for p, (mask, _, _) in zip(ours, expected, strict=True)]) > 0.999
+    )
 
 
 def test_input_is_resized_as_the_library_does(folder: Path):
@@ -102,8 +104,8 @@ def test_thresholds_leave_out_what_they_say(folder: Path):
     whole = proposed(folder)
     middle = float(np.median([p.confidence for p in whole]))
     assert proposed(folder, min_iou=min(max(middle, 0.0), 1.0)) == [p for p in whole if p.confidence > min(middle, 1.0)]
-    least = float(np.median([decode(p.rle).mean() for p in whole]))
-    assert proposed(folder, min_mask_size=least) == [p for p in whole if decode(p.rle).mean() > least]
+    least = float(np.median([decode_rle(p.rle).mean() for p in whole]))
+    assert proposed(folder, min_mask_size=least) == [p for p in whole if decode_rle(p.rle).mean() > least]
     stable = [s for m, iou, s in by_plain_loop(folder, photograph()) if iou > 0 and m.mean() > 3e-4]
     # a mask beside the threshold may fall on either side: see the resized image above
     assert abs(len(proposed(folder, min_stability=0.8)) - sum(s > 0.8 for s in stable)) <= 1

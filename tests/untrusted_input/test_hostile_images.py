@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline.bop.images import image_size, read_depth, read_mask, read_rgb
-from pipeline.bop.masks import decode, read_rle
+from pipeline.bop.masks import decode_rle, read_rle
 
 READERS = {"rgb": read_rgb, "mask": read_mask, "depth": lambda path: read_depth(path, 1.0), "size": image_size}
 
@@ -127,7 +127,7 @@ def test_a_run_length_mask_is_of_the_image_or_refused(size, counts):
     except ValueError as error:
         told = str(error)
     else:
-        assert decode(rle).shape == (12, 9)
+        assert decode_rle(rle).shape == (12, 9)
         return
     assert "\n" not in told
 

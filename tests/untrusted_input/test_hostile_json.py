@@ -14,7 +14,7 @@ from tiny_bop import write_tiny_bop
 
 from pipeline.bop.dataset import open_dataset
 from pipeline.bop.jsonio import read_json
-from pipeline.bop.masks import encode
+from pipeline.bop.masks import encode_rle
 from pipeline.errors import BadInput
 from pipeline.report.run_records import read_run_records
 from pipeline.stages.detect.json import Json
@@ -47,7 +47,7 @@ def detections(root: Path) -> list[dict]:
     mask = np.zeros((48, 64), bool)
     mask[10:20, 10:30] = True
     box = {"scene_id": 7, "image_id": 0, "category_id": 1, "score": 0.5, "bbox": [5, 5, 20, 20], "time": 0.1}
-    return [box, box | {"image_id": 3, "category_id": 2, "segmentation": encode(mask)}]
+    return [box, box | {"image_id": 3, "category_id": 2, "segmentation": encode_rle(mask)}]
 
 
 def everything(root: Path) -> None:

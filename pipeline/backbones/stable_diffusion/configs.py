@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import one_line
+from pipeline.io.checkpoints import first_line
 
 _SCHEDULE = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 _SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
@@ -64,4 +64,4 @@ def alphas_cumprod(scheduler: Mapping[str, Any], where: Path | None = None) -> F
         ddpm: Any = DDPMScheduler(**schedule)
         return ddpm.alphas_cumprod.double().numpy()
     except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
-        raise BadInput(where, found=one_line(error), needed="a schedule of betas that diffusers knows") from None
+        raise BadInput(where, found=first_line(error), needed="a schedule of betas that diffusers knows") from None

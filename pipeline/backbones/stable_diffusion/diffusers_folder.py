@@ -28,7 +28,7 @@ from pipeline.backbones.stable_diffusion.loading import (
     without_decoder,
 )
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import fetched, one_line, pickled_in, read_json, shards
+from pipeline.io.checkpoints import fetch_snapshot, first_line, list_pickles, list_shards, read_json
 
 FIELD = "extract.weights"
 NAME = "stable_diffusion"  # below weights in the configuration
@@ -98,7 +98,7 @@ class DiffusersFolder:
             tokenizer = CLIPTokenizer.from_pretrained(str(folder), local_files_only=True)
             ids = tokenizer(text, padding="max_length", max_length=length, truncation=False)["input_ids"]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BadInput(folder, found=one_line(error), needed="the files of a CLIP tokenizer") from None
+            raise BadInput(folder, found=first_line(error), needed="the files of a CLIP tokenizer") from None
         if len(ids) > length:
             raise BadInput(
                 "extract.prompt", found=f"{len(ids)} tokens", needed=f"at most {length}, begin and end included"
@@ -124,8 +124,8 @@ class DiffusersFolder:
             if (single := folder / f"{stem}{variant}.safetensors").exists():
                 return [single]
             if index.exists():
-                return [index, *shards(index)]
-        pickled = pickled_in(folder)
+                return [index, *list_shards(index)]
+        pickled = list_pickles(folder)
         found = f"only {', '.join(pickled)}" if pickled else "no such file"
         needed = "safetensors: convert it (save_pretrained, safe_serialization=True)" if pickled else "the weights"
         raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
@@ -141,7 +141,7 @@ class DiffusersFolder:
 def download(hub_id: str, revision: str | None) -> Path:
     """Folder of the hub's files that are needed; the half-precision ones only where there are no others."""
     for variant in ("", ".fp16"):
-        folder = fetched(hub_id, revision, _patterns(variant), field=FIELD, name=NAME)
+        folder = fetch_snapshot(hub_id, revision, _patterns(variant), field=FIELD, name=NAME)
         if any((folder / "unet").glob("*.safetensors")):
             break
     return folder

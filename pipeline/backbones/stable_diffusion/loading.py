@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from pipeline.backbones.pretrained import quiet_libraries
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import check_missing, one_line, tensor_shapes
+from pipeline.io.checkpoints import check_missing, first_line, tensor_shapes
 
 _ATTENTION_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 _PORTION = 1 << 26  # values read before a file is mapped anew
@@ -39,7 +39,7 @@ def empty_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: 
         with torch.device("meta"), quiet_libraries():
             model = cls.from_config(dict(config)).to(dtype)
     except (ValueError, TypeError, KeyError, IndexError, RuntimeError, NotImplementedError) as error:
-        raise BadInput(where, found=one_line(error), needed=f"a config of {cls.__name__}") from None
+        raise BadInput(where, found=first_line(error), needed=f"a config of {cls.__name__}") from None
     return model.to_empty(device="cpu")
 
 
@@ -72,7 +72,7 @@ def empty_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Mod
         with quiet_libraries():
             model: Any = CLIPTextModel(CLIPTextConfig.from_dict(dict(config)))
     except (ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
-        raise BadInput(where, found=one_line(error), needed="a config of CLIPTextModel") from None
+        raise BadInput(where, found=first_line(error), needed="a config of CLIPTextModel") from None
     return model, getattr(model, "text_model", model)
 
 

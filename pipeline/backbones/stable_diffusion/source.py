@@ -13,7 +13,7 @@ from pipeline.backbones.stable_diffusion.diffusers_folder import FIELD, NAME, Di
 from pipeline.backbones.stable_diffusion.features import Architecture
 from pipeline.backbones.stable_diffusion.single_file import SingleFile
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import everywhere, is_local
+from pipeline.io.checkpoints import is_local, sweep_hint
 
 
 class Weights(Protocol):
@@ -47,7 +47,7 @@ def find(weights: str, revision: str | None) -> Weights:
         return DiffusersFolder(download(weights, revision))
     path = Path(weights).expanduser()
     if not path.exists():
-        needed = "a diffusers folder or a .safetensors file" + everywhere(NAME)
+        needed = "a diffusers folder or a .safetensors file" + sweep_hint(NAME)
         raise BadInput(FIELD, found=f"{weights!r}, which does not exist", needed=needed)
     if path.is_dir():
         return DiffusersFolder(path)

@@ -11,7 +11,7 @@ from torch import nn
 
 from pipeline.backbones.pretrained import load_pretrained, quiet_libraries, whole_text
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import everywhere, fetched, is_local, pickled_in, read_json, shards
+from pipeline.io.checkpoints import fetch_snapshot, is_local, list_pickles, list_shards, read_json, sweep_hint
 
 FIELD = "extract.weights"
 CLASSES = {
@@ -39,11 +39,11 @@ class Architecture:
 def find(weights: str, revision: str | None, model_types: tuple[str, ...], name: str) -> TransformersFolder:
     """What lies at a hub id or in a local folder. Raises BadInput; ``name``: that of the field below ``weights``."""
     if not is_local(weights):
-        return TransformersFolder(fetched(weights, revision, _PATTERNS, field=FIELD, name=name), model_types)
+        return TransformersFolder(fetch_snapshot(weights, revision, _PATTERNS, field=FIELD, name=name), model_types)
     path = Path(weights).expanduser()
     if not path.is_dir():
         found = f"{weights!r}, which is {'a file' if path.exists() else 'not there'}"
-        needed = "a folder as save_pretrained writes it, or a hub id" + everywhere(name)
+        needed = "a folder as save_pretrained writes it, or a hub id" + sweep_hint(name)
         raise BadInput(FIELD, found=found, needed=needed)
     return TransformersFolder(path, model_types)
 
@@ -113,8 +113,8 @@ class TransformersFolder:
         if (self.root / _SINGLE).exists():
             return [self.root / _SINGLE]
         if (self.root / _INDEX).exists():
-            return [self.root / _INDEX, *shards(self.root / _INDEX)]
-        pickled = pickled_in(self.root)
+            return [self.root / _INDEX, *list_shards(self.root / _INDEX)]
+        pickled = list_pickles(self.root)
         found = f"only {', '.join(pickled)}" if pickled else "no such file"
         needed = "safetensors: convert it (save_pretrained), or name a revision of the hub that has them"
         raise BadInput(self.root / _SINGLE, found=found, needed=needed if pickled else f"the weights; {needed}")

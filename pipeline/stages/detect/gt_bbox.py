@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.jsonio import place
+from pipeline.bop.jsonio import describe_place
 from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.items.views import Detection, Target
@@ -38,7 +38,7 @@ class GtBbox(Spec):
             path = dataset.scene(scene_id).folder / "scene_gt_info.json"
             if not path.exists():
                 raise BadInput(
-                    place(path, scene=scene_id), found="no such file", needed=f"bbox_{self.bbox} of instances"
+                    describe_place(path, scene=scene_id), found="no such file", needed=f"bbox_{self.bbox} of instances"
                 )
         return [self._detection(target, gt) for target in targets for gt in annotated(dataset, target)]
 

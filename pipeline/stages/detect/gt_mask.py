@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.masks import encode
+from pipeline.bop.masks import encode_rle
 from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
@@ -57,4 +57,4 @@ class GtMask(Spec):
             defect = f"mask of {list(mask.shape)} where the image is {list(size_hw)} (height, width)"
         elif not mask.any():
             defect = "mask is empty"
-        return Detection(*ids, gt.obj_id, 1.0, 0.0, mask_bbox(mask) or box, encode(mask), gt.gt_id, defect)
+        return Detection(*ids, gt.obj_id, 1.0, 0.0, mask_bbox(mask) or box, encode_rle(mask), gt.gt_id, defect)

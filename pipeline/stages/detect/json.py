@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.jsonio import brief, get, integer, is_number, place, read_json
-from pipeline.bop.masks import area, decode, read_rle
-from pipeline.bop.scene import Box, edges
+from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_integer, is_number, read_json
+from pipeline.bop.masks import decode_rle, read_rle, rle_area
+from pipeline.bop.scene import Box, xyxy_from_xywh
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.io.digests import file_digest
@@ -80,11 +80,11 @@ def _by_target(path: Path) -> dict[tuple[int, int, int], list[dict[str, Any]]]:
         raise BadInput(path, found=f"a JSON {type(entries).__name__}", needed="a list of detections")
     by_target: dict[tuple[int, int, int], list[dict[str, Any]]] = defaultdict(list)
     for index, entry in enumerate(entries):
-        where = place(path, detection=index)
-        scene_id, im_id, obj_id = (integer(entry, name, where) for name in ("scene_id", "image_id", "category_id"))
-        get(entry, "score", where)
+        where = describe_place(path, detection=index)
+        scene_id, im_id, obj_id = (get_integer(entry, name, where) for name in ("scene_id", "image_id", "category_id"))
+        get_field(entry, "score", where)
         if "segmentation" not in entry:
-            get(entry, "bbox", where)
+            get_field(entry, "bbox", where)
         by_target[scene_id, im_id, obj_id].append(entry)
     return by_target
 
@@ -95,7 +95,7 @@ def _detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, int]) 
     time_s = float(time) if is_number(time) and math.isfinite(time) else -1.0
     try:
         if not math.isfinite(score):
-            raise ValueError(f"score is {brief(entry['score'])}, not a finite number")
+            raise ValueError(f"score is {abbreviate(entry['score'])}, not a finite number")
         rle = None if entry.get("segmentation") is None else _mask(entry["segmentation"], size_hw)
         box = _box(entry.get("bbox"), rle, size_hw)
     except ValueError as fault:
@@ -105,7 +105,7 @@ def _detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, int]) 
 
 def _mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
     rle = read_rle(segmentation, size_hw)
-    if not area(rle):
+    if not rle_area(rle):
         raise ValueError("mask is empty")
     return rle
 
@@ -113,12 +113,12 @@ def _mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
 def _box(bbox_xywh: Any, rle: dict[str, Any] | None, size_hw: tuple[int, int]) -> Box:
     """Edges of the entry's box, of its mask when it has no box. Raises ValueError."""
     if bbox_xywh is None and rle is not None:
-        return mask_bbox(decode(rle)) or (0.0,) * 4
+        return mask_bbox(decode_rle(rle)) or (0.0,) * 4
     if not isinstance(bbox_xywh, list) or len(bbox_xywh) != 4 or not all(is_number(v) for v in bbox_xywh):
-        raise ValueError(f"bbox is {brief(bbox_xywh)}, not 4 numbers")
+        raise ValueError(f"bbox is {abbreviate(bbox_xywh)}, not 4 numbers")
     if not all(map(math.isfinite, bbox_xywh)):
         raise ValueError(f"bbox is {bbox_xywh}, not finite")
-    x0, y0, x1, y1 = box = edges([float(v) for v in bbox_xywh])
+    x0, y0, x1, y1 = box = xyxy_from_xywh([float(v) for v in bbox_xywh])
     if rle is None and (x1 <= x0 or y1 <= y0):
         raise ValueError(f"bbox {bbox_xywh} has no area")
     h, w = size_hw

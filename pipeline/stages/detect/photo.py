@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.images import read_mask
-from pipeline.bop.masks import encode
+from pipeline.bop.masks import encode_rle
 from pipeline.bop.photo import Photo
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
@@ -59,4 +59,4 @@ def _detection(photo: Photo, target: Target) -> Detection:
     box = mask_bbox(mask)
     if box is None:
         raise BadInput(photo.mask_file, found="an empty mask", needed="the object's pixels not black")
-    return Detection(*ids, 1.0, 0.0, box, encode(mask))
+    return Detection(*ids, 1.0, 0.0, box, encode_rle(mask))

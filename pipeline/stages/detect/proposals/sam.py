@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.backbones.sam import SamWeights, find
-from pipeline.bop.masks import encode
+from pipeline.bop.masks import encode_rle
 from pipeline.functional.boxes import area, non_maximum_suppression
 from pipeline.functional.camera import mask_bbox
 from pipeline.io.checkpoints import tensor_shapes
@@ -95,7 +95,7 @@ class SamProposing:
         """See Proposing."""
         size_hw = (image.rgb.shape[0], image.rgb.shape[1])
         found = [
-            Proposal(box, encode(mask), confidence)
+            Proposal(box, encode_rle(mask), confidence)
             for logits, iou in self._decoded(image.rgb)
             for mask, confidence in self._reliable(logits, iou, size_hw)
             if (box := mask_bbox(mask)) is not None and mask.mean() > self.spec.min_mask_size
