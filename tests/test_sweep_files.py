@@ -8,7 +8,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from pipeline.__main__ import stages_of
-from pipeline.report.figures import TITLES
+from pipeline.report.names import AXIS_TITLES
 from pipeline.report.published import ABLATIONS
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -66,4 +66,4 @@ def test_the_command_line_wins_over_a_variation():
 
 def test_every_swept_axis_has_a_title():
     axes = {key for name in SWEEPS for key in grid(name)} - {"variation", "evaluate.theta_max", "method"}
-    assert axes <= set(TITLES)
+    assert axes <= set(AXIS_TITLES)

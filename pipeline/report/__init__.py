@@ -1,1 +1,1 @@
-"""What a person looks at: overlays, and later tables, figures and pages."""
+"""Results for people: overlays, the gallery, terminal tables, and the report of many runs as one HTML page."""

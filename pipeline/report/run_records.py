@@ -83,6 +83,11 @@ class RunRecord:
     templates: Mapping[tuple[int, int, int, int], TemplateError] = field(default_factory=dict)
     cases: tuple[Case, ...] = ()
 
+    def require_scores(self) -> Scores:
+        """The scores of a run that was evaluated."""
+        assert self.scores is not None, f"run {self.id} has no scores"
+        return self.scores
+
 
 def run_id(config: Mapping[str, Any]) -> str:
     """Identity of a run: digest of its configuration without the fields that cannot change results."""

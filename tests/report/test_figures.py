@@ -7,6 +7,7 @@ from toy_runs import toy_run
 
 from pipeline.report import figures
 from pipeline.report.families import families
+from pipeline.report.plotting import SIZE, Figure
 
 
 def of_many_objects(count: int):
@@ -14,7 +15,7 @@ def of_many_objects(count: int):
     return replace(row, scores=replace(row.scores, obj_id=np.arange(2 * count) % count + 1))
 
 
-def objects_of(figure: figures.Figure) -> list[int]:
+def objects_of(figure: Figure) -> list[int]:
     return [int(label.get_text()) for label in figure.canvas.axes[0].get_xticklabels()]
 
 
@@ -23,8 +24,8 @@ def test_many_objects_are_shared_out_over_figures_of_few_bars(runs):
     drawn = figures.objects_figures({str(n): of_many_objects(30) for n in range(runs)}, "tless")
     assert [obj_id for figure in drawn for obj_id in objects_of(figure)] == list(range(1, 31))
     for figure in drawn:
-        assert len(objects_of(figure)) * (runs + 2) <= figures.MOST_BARS
-        assert tuple(figure.canvas.get_size_inches()) == figures.SIZE
+        assert len(objects_of(figure)) * (runs + 2) <= figures.MAX_BARS
+        assert tuple(figure.canvas.get_size_inches()) == SIZE
 
 
 def test_published_bars_are_hollow_dashed_and_only_of_their_own_dataset():

@@ -8,8 +8,9 @@ from PIL import Image
 from toy_runs import failed_run, toy_run
 
 from pipeline.errors import BadInput
-from pipeline.report.page import Section, _breakable, sections_of, write_report
+from pipeline.report.page import _breakable, write_report
 from pipeline.report.run_records import Case, read_run_records, write_run_record
+from pipeline.report.section import Section, sections_of
 
 LIMIT_BYTES = 15_000_000
 
@@ -72,18 +73,18 @@ def test_what_a_run_says_is_text_and_no_markup(built):
 def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
     other = [toy_run(0.9, key="q" * 64, at=50, instances=21)]
     found = sections_of([*rows, *other])
-    assert [len(section.rows) for section in found] == [1, 4]
+    assert [len(section.runs) for section in found] == [1, 4]
     assert found[0].title.startswith("demo test: 21 targets")
     assert found[0].title.endswith("(qqqqqq)")
     text = page([rows[0], *other], tmp_path)
-    assert "nothing is compared across them" in text
+    assert "results are not compared across sections" in text
     assert text.count('<section id="d-') == 2
 
 
 def test_runs_that_differ_in_reported_thresholds_alone_are_shown_once(rows):
     twins = [toy_run(0.5, evaluate__theta_max=bound) for bound in (0.1, 0.2)]
     section = Section([*rows[:4], *twins], "demo")
-    assert len(section.rows) == 4
+    assert len(section.runs) == 4
     assert len(section.jobs) == 6
 
 
@@ -105,7 +106,7 @@ def test_a_run_scored_on_other_meshes_is_shown_by_name_and_never_the_best():
     assert section.best is base
     assert section.name(easier) == "evaluate.models=models"
     twins = [base, replace(easier, run=base.run)]
-    assert len(Section(twins, "demo").rows) == 2
+    assert len(Section(twins, "demo").runs) == 2
 
 
 def test_published_recalls_of_a_dataset_stand_beside_its_runs_marked_so(tmp_path):

@@ -7,21 +7,24 @@ from toy_runs import toy_run
 from pipeline.metrics.recall import average_recall
 from pipeline.report import published, tables
 from pipeline.report.families import families
-from pipeline.report.figures import ar_interval
+from pipeline.report.published_tables import published_tables
+from pipeline.report.run_statistics import ar_interval, paired_difference
+from pipeline.report.table import Table
+from pipeline.report.variation_tables import correspondence_table, ladder_table
 
 
-def columns(table: tables.Table) -> list[dict[str, str]]:
+def columns(table: Table) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(table.csv())))
 
 
 def test_a_difference_is_paired_and_starred_when_it_is_more_than_chance():
     base, better, same = toy_run(0.4), toy_run(0.6, cluster__count=40), toy_run(0.4, cluster__count=80)
     rows = {row["run"]: row for row in columns(tables.runs_table([base, better, same], base))}
-    assert rows["dzop-hog"]["to base"] == "base"
-    assert rows["cluster.count=40"]["to base"].endswith("*")
-    assert rows["cluster.count=80"]["to base"] == "+0.000 (+0.000 to +0.000)"
+    assert rows["dzop-hog"]["vs base"] == "base"
+    assert rows["cluster.count=40"]["vs base"].endswith("*")
+    assert rows["cluster.count=80"]["vs base"] == "+0.000 (+0.000 to +0.000)"
     gain = ar_interval(better.scores).mean - ar_interval(base.scores).mean
-    assert rows["cluster.count=40"]["to base"].startswith(f"{gain:+.3f}")
+    assert rows["cluster.count=40"]["vs base"].startswith(f"{gain:+.3f}")
 
 
 def test_without_vsd_the_mean_of_two_is_not_called_ar():
@@ -49,8 +52,8 @@ def test_no_table_calls_the_mean_of_two_ar():
     ]
     family = families([rows[0], toy_run(vsd=False, cluster__count=40)])[0]
     made = [
-        tables.correspondence_table([*rows, toy_run(vsd=False, variation="no_subpixel", correspond__kernel=1)]),
-        tables.ladder_table(rows),
+        correspondence_table([*rows, toy_run(vsd=False, variation="no_subpixel", correspond__kernel=1)]),
+        ladder_table(rows),
         tables.improvement_table([("ours", rows[0]), ("theirs", toy_run(vsd=False, method="zs6d"))]),
         tables.family_table(family),
     ]
@@ -60,8 +63,8 @@ def test_no_table_calls_the_mean_of_two_ar():
 
 
 def test_runs_on_other_instances_have_no_difference():
-    assert tables.paired(toy_run(), toy_run(instances=21)) is None
-    assert tables.signed(None) == "n/a"
+    assert paired_difference(toy_run(), toy_run(instances=21)) is None
+    assert tables.signed_text(None) == "n/a"
 
 
 def test_the_correspondence_table_has_the_papers_four_rows():
@@ -73,12 +76,12 @@ def test_the_correspondence_table_has_the_papers_four_rows():
         toy_run(0.4),
         toy_run(0.9, cluster__count=40),
     ]
-    table = tables.correspondence_table(rows)
+    table = correspondence_table(rows)
     assert [row[:3] for row in table.rows] == [
         ("no", "yes", "no"), ("yes", "no", "no"), ("yes", "yes", "no"), ("yes", "yes", "yes"),
     ]  # fmt: skip
     assert [row[3] for row in table.rows] == [f"{ar_interval(row.scores).mean:.3f}" for row in rows[:4]]
-    assert tables.correspondence_table([toy_run(), toy_run(cluster__count=40)]) is None
+    assert correspondence_table([toy_run(), toy_run(cluster__count=40)]) is None
 
 
 def test_the_ladder_says_what_each_rung_gains():
@@ -88,11 +91,11 @@ def test_the_ladder_says_what_each_rung_gains():
         toy_run(0.3, variation="oracle_mask"),
         toy_run(0.6, variation="oracle_template", match=oracle),
     ]
-    table = tables.ladder_table(rows)
+    table = ladder_table(rows)
     assert [row[0] for row in table.rows] == ["as estimated", "true mask", "true mask, template"]
     assert table.rows[0][3] == ""
     assert table.rows[2][3].startswith("+")
-    assert tables.ladder_table(rows[:2]) is None
+    assert ladder_table(rows[:2]) is None
 
 
 def test_improvements_are_relative_to_the_other_method():
@@ -113,7 +116,7 @@ def test_jobs_say_what_they_computed_and_what_they_reused():
 
 
 def test_every_csv_row_says_whether_it_was_measured_or_published():
-    for table in tables.published_tables():
+    for table in published_tables():
         assert {row["source"] for row in columns(table)} == {"published"}
     base = toy_run()
     family = families([base, toy_run(cluster__count=40)])[0]
