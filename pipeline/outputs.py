@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.bop.detections import write_detections
 from pipeline.bop.results import make_rows, results_name, write_results
-from pipeline.graph import Graph, Judged, Retraced, ScoreNodes
+from pipeline.graph import Graph, PoseEvaluation, Retraced, ScoreNodes
 from pipeline.io.files import write_json
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_to_record
@@ -51,7 +51,7 @@ class Outputs:
     @cached_property
     def csv(self) -> str:
         """Name of the results file."""
-        data = self.graph.run.dataset
+        data = self.graph.context.dataset
         return results_name(self.name, data.name, data.split)
 
     @cached_property
@@ -62,7 +62,7 @@ class Outputs:
     @property
     def overlays(self) -> Path:
         """Folder of the overlays: another for poses that are not held against the ground truth there is."""
-        annotated = all(self.graph.run.dataset.has_ground_truth(t.scene_id) for t in self.graph.run.targets)
+        annotated = all(self.graph.context.dataset.has_ground_truth(t.scene_id) for t in self.graph.context.targets)
         return self.folder / ("overlays" if self.scores or not annotated else "overlays-unchecked")
 
     @cached_property
@@ -86,7 +86,7 @@ class Outputs:
         write_detections(path, self.graph.detections.all)
         return path
 
-    def write_files(self, answers: Sequence[Answer], judged: Judged | None, warnings: Sequence[str]) -> None:
+    def write_files(self, answers: Sequence[Answer], judged: PoseEvaluation | None, warnings: Sequence[str]) -> None:
         """The csv, poses.json (``warnings``: odd detections), and detections.json of those not read from a file."""
         if self.graph.detections.proposals:
             self.write_detections()
@@ -99,9 +99,9 @@ class Outputs:
         record = {
             "run": self.graph.poses.run_ref().key,
             "method": self.name,
-            "dataset": self.graph.run.dataset.name,
+            "dataset": self.graph.context.dataset.name,
             "config": self.config,
-            "counts": self.graph.run.progress.as_record(),
+            "counts": self.graph.context.progress.as_record(),
             "scores": judged and summary_of(judged.scored),
             "warnings": list(warnings),
             "answers": told,
@@ -118,23 +118,23 @@ class Outputs:
             lines.append(f"overlays  {self.overlays}  ({right if self.scores else 'estimates'})")
         return "\n" + "\n".join(lines)
 
-    def draw_overlays(self, answers: Sequence[Answer], judged: Judged | None) -> None:
+    def draw_overlays(self, answers: Sequence[Answer], judged: PoseEvaluation | None) -> None:
         """A picture for every image; those that are there are left, since the folder is the key of what they show."""
         by_image: defaultdict[ImageId, list[tuple[Answer, PoseErrors | None]]] = defaultdict(list)
         for answer, errors in zip(answers, _errors(answers, judged), strict=True):
             by_image[answer.scene_id, answer.im_id].append((answer, errors))
         start, drawn = time.perf_counter(), 0
-        with self.graph.run.progress.bar(len(by_image), "overlays", "image") as advance:
+        with self.graph.context.progress.bar(len(by_image), "overlays", "image") as advance:
             for image, shown in sorted(by_image.items()):
                 path = self.overlays / f"{image[0]:06d}_{image[1]:06d}.jpg"
                 if not path.exists():
-                    write_overlay(path, draw_overlay(self.graph.run.dataset.image(*image), self._drawn(shown)))
+                    write_overlay(path, draw_overlay(self.graph.context.dataset.image(*image), self._drawn(shown)))
                     drawn += 1
                 advance(1)
         seconds = time.perf_counter() - start
-        self.graph.run.progress.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
+        self.graph.context.progress.add("overlays", computed=drawn, reused=len(by_image) - drawn, time_s=seconds)
 
-    def draw_gallery(self, answers: Sequence[Answer], judged: Judged, count: int) -> list[Case]:
+    def draw_gallery(self, answers: Sequence[Answer], judged: PoseEvaluation, count: int) -> list[Case]:
         """Pictures of how the best and the worst answers came about; those that are there are left."""
         if not count:
             return []
@@ -142,7 +142,7 @@ class Outputs:
         retrace, errors = self.graph.retracer(), _errors(answers, judged)
         relative = [None if e is None else e.relative_mssd for e in errors]
         chosen = pick_cases(relative, count=count, obj_ids=[a.obj_id for a in answers])
-        with self.graph.run.progress.bar(len(chosen), "gallery", "picture") as advance:
+        with self.graph.context.progress.bar(len(chosen), "gallery", "picture") as advance:
             for index in sorted(chosen, key=lambda i: answers[i].obj_id):
                 answer = answers[index]
                 path = self.folder / "gallery" / f"{_named(answer)}.jpg"
@@ -152,13 +152,13 @@ class Outputs:
                 advance(1)
         cases = [self._case(answers[index], errors[index]) for index in chosen]
         seconds = time.perf_counter() - start
-        self.graph.run.progress.add("gallery", computed=drawn, reused=len(chosen) - drawn, time_s=seconds)
+        self.graph.context.progress.add("gallery", computed=drawn, reused=len(chosen) - drawn, time_s=seconds)
         return [case for case in cases if (self.folder / case.file).exists()]
 
     def _card(self, answer: Answer, errors: PoseErrors | None, traced: Retraced) -> Card:
         best = traced.hypothesis
         return Card(
-            photo=self.graph.run.dataset.image(answer.scene_id, answer.im_id),
+            photo=self.graph.context.dataset.image(answer.scene_id, answer.im_id),
             bbox_xyxy=traced.detection.bbox_xyxy,
             drawn=[replace(item, label="") for item in self._drawn([(answer, errors)], gt_id=answer.gt_id)],
             query_rgb=traced.query_rgb,
@@ -181,7 +181,7 @@ class Outputs:
 
         ``gt_id``: of this instance alone.
         """
-        run, first = self.graph.run, shown[0][0]
+        run, first = self.graph.context, shown[0][0]
         asked = {answer.obj_id for answer, _ in shown} if self.scores else set()
         truths = run.dataset.ground_truth(first.scene_id, first.im_id) if asked else []
         wanted = [gt for gt in truths if gt.obj_id in asked and gt_id in (None, gt.gt_id)]
@@ -192,10 +192,10 @@ class Outputs:
                 drawn.append(DrawnPose(run.model(answer.obj_id).mesh, answer.T_cam_obj, _role(errors), label))
         return drawn
 
-    def write_run_record(self, answers: Sequence[Answer], judged: Judged, cases: Sequence[Case]) -> None:
+    def write_run_record(self, answers: Sequence[Answer], judged: PoseEvaluation, cases: Sequence[Case]) -> None:
         """The row that reports read."""
         assert self.scores is not None
-        run, scores = self.graph.run, judged.scored.scores
+        run, scores = self.graph.context, judged.scored.scores
         metrics = summary_of(judged.scored, theta_max=self.theta_max)["metrics"]
         missing = Counter((a.stage, a.reason) for a in answers if isinstance(a, NoEstimate))
         row = RunRecord(
@@ -232,8 +232,8 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
-def _errors(answers: Sequence[Answer], judged: Judged | None) -> Sequence[PoseErrors | None]:
-    return [None] * len(answers) if judged is None else judged.of
+def _errors(answers: Sequence[Answer], judged: PoseEvaluation | None) -> Sequence[PoseErrors | None]:
+    return [None] * len(answers) if judged is None else judged.by_answer
 
 
 def _named(answer: Answer) -> str:
@@ -263,7 +263,7 @@ def _median_times(answers: Sequence[Answer]) -> dict[str, float]:
     return {stage: float(np.median([by_stage.get(stage, 0.0) for by_stage in times])) for stage in stages}
 
 
-def _template_metrics(judged: Judged, instances: int) -> dict[str, float | None]:
+def _template_metrics(judged: PoseEvaluation, instances: int) -> dict[str, float | None]:
     """Acc15 in its three readings, over all instances, and the mean angle, over those with a matched template."""
     told: dict[str, float | None] = {}
     for reading in (f.name for f in fields(TemplateError)):

@@ -78,34 +78,34 @@ class RayWorkers:
     _most: int = 0
     _began: bool = False
 
-    def each(self, work: str, units: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
-        """As Workers.each."""
-        self._start(len(units))
-        waiting, lost = deque(units), Counter[Any]()
+    def map(self, task: str, items: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
+        """As Workers.map."""
+        self._start(len(items))
+        waiting, lost = deque(items), Counter[Any]()
         busy: dict[Any, tuple[Any, Any]] = {}
         while waiting or busy:
             while waiting and self._idle:
-                worker, unit = self._idle.pop(), waiting.popleft()
-                busy[worker.do.remote(work, unit)] = worker, unit
+                worker, item = self._idle.pop(), waiting.popleft()
+                busy[worker.do.remote(task, item)] = worker, item
             for answer in self._answers(busy):
-                worker, unit = busy.pop(answer)
+                worker, item = busy.pop(answer)
                 try:
                     counts, fault = ray.get(answer)
                 except faults.RayTaskError:
                     raise  # a fault of ours, with its trace
                 except (faults.RayActorError, faults.WorkerCrashedError, faults.ObjectLostError) as error:
-                    lost[unit] += 1
-                    if lost[unit] > self.runtime.retries:
-                        told = f"{work} of {unit}: lost {lost[unit]} workers, the last with: {_brief(error)}"
+                    lost[item] += 1
+                    if lost[item] > self.runtime.retries:
+                        told = f"{task} of {item}: lost {lost[item]} workers, the last with: {_brief(error)}"
                         raise DzopError(f"{told}; often for want of memory: fewer runtime.actors") from None
-                    self._say(f"{work} of {unit}: its worker was lost; another goes on with it")
-                    waiting.appendleft(unit)
+                    self._say(f"{task} of {item}: its worker was lost; another goes on with it")
+                    waiting.appendleft(item)
                     self._hire()
                 else:
                     self._idle.append(worker)
                     if fault:
                         raise DzopError(fault)
-                    yield unit, counts
+                    yield item, counts
 
     def _answers(self, busy: dict[Any, Any]) -> list[Any]:
         """Answers that are there, once one is; workers that have started meanwhile are idle then."""

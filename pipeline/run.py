@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pipeline.bop.dataset import Dataset
 from pipeline.errors import BadInput
-from pipeline.graph import Context, Graph, Judged, Node, ScoreNodes, use_threads
+from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, use_threads
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.io.digests import remember_in
 from pipeline.items.poses import NoEstimate
@@ -129,7 +129,7 @@ def _steps(graph: Graph, options: Options) -> None:
     """The steps asked for."""
     graph.check()
     graph.hold_to_vram()
-    run = graph.run
+    run = graph.context
     print(_headline(options, run.stages, run.dataset, run.targets, run.store), flush=True)
     try:
         if options.step == "onboard":
@@ -142,12 +142,12 @@ def _steps(graph: Graph, options: Options) -> None:
         needed = "a smaller runtime.batch (0 = sized to memory), extract.dtype=float16, or more in runtime.max_vram"
         raise BadInput(f"memory of {run.device}", found=" ".join(str(error).split())[:200], needed=needed) from None
     finally:
-        run.rates.save()
+        run.timings.save()
 
 
 def _plan(graph: Graph, options: Options) -> None:
     """Every node, and what the missing ones will cost; nothing is computed and nothing fetched."""
-    run, unknown = graph.run, None
+    run, unknown = graph.context, None
     nodes: list[Node] = []
     try:
         graph.check()
@@ -200,10 +200,10 @@ def _estimate(graph: Graph, options: Options) -> None:
     if options.resume and scores is not None and outputs.finished():
         print(f"finished before: {outputs.run_record_path}")
         return
-    for doubt in (odd := graph.doubts())[:ROWS_SHOWN]:
+    for doubt in (odd := graph.warnings())[:ROWS_SHOWN]:
         print(f"warning: {doubt}", flush=True)
     answers = graph.estimate()
-    judged = None if scores is None else scores.judge(answers)
+    judged = None if scores is None else scores.evaluate(answers)
     outputs.write_files(answers, judged, odd)
     if options.overlays:
         outputs.draw_overlays(answers, judged)
@@ -224,13 +224,13 @@ def _check_folder(out: Path) -> None:
 
 def _scores(graph: Graph, options: Options) -> ScoreNodes | None:
     """The node of the run's scores, None where poses alone are asked for or nothing is annotated."""
-    data, chosen = graph.run.dataset, options.evaluate
+    data, chosen = graph.context.dataset, options.evaluate
     if options.step == "estimate":
         return None
     if not np.isclose(THETAS, chosen.theta_max).any():
         needed = f"one of BOP's thresholds: {', '.join(f'{theta:g}' for theta in THETAS)}"
         raise BadInput("evaluate.theta_max", found=chosen.theta_max, needed=needed)
-    bare = sorted({t.scene_id for t in graph.run.targets if not data.has_ground_truth(t.scene_id)})
+    bare = sorted({t.scene_id for t in graph.context.targets if not data.has_ground_truth(t.scene_id)})
     if bare:
         if options.step == "evaluate":
             where = data.root / data.split / f"{bare[0]:06d}"
@@ -242,13 +242,13 @@ def _scores(graph: Graph, options: Options) -> ScoreNodes | None:
             data.root / chosen.models, found="no such folder", needed="the meshes that evaluate.models names"
         )
     models = chosen.models if there else data.models
-    scorer = Scorer(data, graph.run.targets, models, vsd_delta_mm=chosen.vsd_delta_mm, with_vsd=chosen.vsd)
+    scorer = Scorer(data, graph.context.targets, models, vsd_delta_mm=chosen.vsd_delta_mm, with_vsd=chosen.vsd)
     return graph.scores(scorer, correspondences=chosen.correspondences)
 
 
-def _show(answers: Sequence[Answer], judged: Judged | None, *, theta_max: float) -> None:
+def _show(answers: Sequence[Answer], judged: PoseEvaluation | None, *, theta_max: float) -> None:
     """Tables for the terminal."""
-    errors: Sequence[PoseErrors | None] = [None] * len(answers) if judged is None else judged.of
+    errors: Sequence[PoseErrors | None] = [None] * len(answers) if judged is None else judged.by_answer
     rows = list(zip(answers, errors, strict=True))
     print("\n" + (answers_table(rows) if len(rows) <= ROWS_SHOWN else objects_table(rows)))
     missing = [answer for answer in answers if isinstance(answer, NoEstimate)]

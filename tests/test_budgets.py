@@ -17,7 +17,7 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from pipeline.backbones.batching import Footprint, fitting_batch
 from pipeline.errors import BadInput
 from pipeline.graph import Graph, Memory
-from pipeline.graph.lru import Kept
+from pipeline.graph.lru import LRUCache
 from pipeline.graph.plan import Node
 from pipeline.spec import Runtime
 from pipeline.store import LocalStoreConfig, Store
@@ -181,7 +181,7 @@ def test_templates_of_one_object_are_in_memory_at_a_time(dzop, monkeypatch):
 
 def test_the_last_values_are_kept_as_far_as_they_fit():
     made: list[int] = []
-    kept = Kept(lambda key: made.append(key) or key, lambda value: value, limit=10)
+    kept = LRUCache(lambda key: made.append(key) or key, lambda value: value, limit=10)
     for key in (3, 4, 3, 5, 3, 4, 99, 99):
         assert kept(key) == key
     assert made == [3, 4, 5, 4, 99]

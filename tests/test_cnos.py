@@ -128,7 +128,7 @@ def graph_of(scene: Path, cache: Path, *, extract: Any = None, **changes: Any) -
 
 
 def computed(graph: Graph) -> dict[str, int]:
-    return {step: count.computed for step, count in graph.run.progress.counts.items()}
+    return {step: count.computed for step, count in graph.context.progress.counts.items()}
 
 
 def dataset_of(scene: Path) -> Dataset:
@@ -151,7 +151,7 @@ def test_a_second_run_proposes_and_describes_nothing(painted: Path, cache: Path)
     CALLS.clear()
     again = graph_of(painted, cache)
     answers = again.estimate()
-    assert len(answers) == len(again.run.targets)
+    assert len(answers) == len(again.context.targets)
     assert set(computed(again).values()) == {0}
     assert CALLS == []
 
@@ -178,18 +178,20 @@ def test_templates_of_the_route_are_those_that_are_described(painted: Path, cach
     graph = graph_of(painted, cache, describe=Hog(), describe_layer=Cosine().layer)
     described = graph.detections.proposals
     assert described is not None
-    assert described.run is graph.run  # one backbone in memory
+    assert described.context is graph.context  # one backbone in memory
     assert described.template_features(1) == graph.templates.features(1, Cosine().layer)
     graph.estimate()
-    rows = 24 * len(graph.run.object_ids)
-    assert graph.run.progress.step("template features").computed <= 2 * rows  # layer 2 for both, layer 8 for the route
+    rows = 24 * len(graph.context.object_ids)
+    assert (
+        graph.context.progress.step("template features").computed <= 2 * rows
+    )  # layer 2 for both, layer 8 for the route
 
 
 def test_detections_come_back_from_their_file(painted: Path, cache: Path, tmp_path: Path):
     graph = graph_of(painted, cache, keep="all")
     usable = [d for d in graph.detections.all if d.defect is None]
     write_detections(tmp_path / "detections.json", graph.detections.all)
-    read = Json(path=str(tmp_path / "detections.json"), keep="all")(graph.run.dataset, graph.run.targets)
+    read = Json(path=str(tmp_path / "detections.json"), keep="all")(graph.context.dataset, graph.context.targets)
     assert read == usable
     entry = json.loads((tmp_path / "detections.json").read_text())[0]
     assert set(entry) == {"scene_id", "image_id", "category_id", "bbox", "score", "time", "segmentation"}
@@ -199,7 +201,7 @@ def test_detections_come_back_from_their_file(painted: Path, cache: Path, tmp_pa
 def test_an_image_without_a_proposal_answers_why(painted: Path, cache: Path):
     graph = graph_of(painted, cache, proposals=TrueMasks(root=str(painted), blind=(0,)))
     answers = [a for a in graph.estimate() if a.im_id == 0]
-    assert len(answers) == len([t for t in graph.run.targets if t.im_id == 0]) > 0
+    assert len(answers) == len([t for t in graph.context.targets if t.im_id == 0]) > 0
     for answer in answers:
         assert isinstance(answer, NoEstimate)
         assert (answer.stage, answer.reason) == ("detect", "no mask was proposed in the image")
@@ -231,7 +233,7 @@ def test_an_interrupted_run_goes_on_with_the_images_that_are_left(painted: Path,
     graph = graph_of(painted, tmp_path)
     described = graph.detections.proposals
     assert described is not None
-    first, *others = graph.run.image_ids
+    first, *others = graph.context.image_ids
     graph.do("proposals", first)
     CALLS.clear()
     graph_of(painted, tmp_path).detect()

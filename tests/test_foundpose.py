@@ -109,7 +109,7 @@ def test_crops_of_a_camera_that_turns_are_kept_by_their_camera(tmp_path, crop, m
         chosen, dataset = stages(), open_dataset(root, name="tiny")
         changed = type(chosen)(**{**vars(chosen), "crop": crop})
         graph = Graph(Context(changed, dataset, dataset.targets, Store(MemoryStoreConfig()), Runtime(progress=False)))
-        return [graph.queries.crops(image).key for image in graph.run.image_ids]
+        return [graph.queries.crops(image).key for image in graph.context.image_ids]
 
     before = keys()
     edit_json(

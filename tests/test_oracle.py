@@ -66,9 +66,9 @@ def errors(scenes: Dataset, store: Store, **changes: object) -> list[PoseErrors]
     stages = replace(FULL, **changes)
     graph = Graph(Context(stages, scenes, scenes.targets, store, Runtime(progress=False)))
     answers = graph.estimate()
-    judged = graph.scores(Scorer(scenes, scenes.targets, "models", with_vsd=False)).judge(answers)
+    judged = graph.scores(Scorer(scenes, scenes.targets, "models", with_vsd=False)).evaluate(answers)
     assert all(isinstance(answer, PoseEstimate) for answer in answers)
-    return [found for found in judged.of if found is not None]
+    return [found for found in judged.by_answer if found is not None]
 
 
 @pytest.mark.slow

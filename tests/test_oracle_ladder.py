@@ -61,7 +61,7 @@ def test_other_true_poses_are_other_poses_for_an_oracle_and_the_same_for_everyth
 @pytest.mark.parametrize(("changes", "shown"), [({}, False), *((changes, True) for changes in ORACLES.values())])
 def test_a_query_carries_the_truth_for_an_oracle_alone(scene, changes, shown):
     graph = graph_of(scene, **changes)
-    image = graph.run.image_ids[0]
+    image = graph.context.image_ids[0]
     found = graph.queries.make_crops(image)
     graph.queries.make_features(image, found)
     query, _ = graph.poses.query(found[0])
@@ -81,10 +81,10 @@ def test_no_matcher_comes_nearer_to_the_true_view_than_the_oracle(scene):
 
 def view_error_deg(graph: Graph, answer) -> float:
     """Angle from the matched template to the true pose as it would look on the optical axis."""
-    truth = graph.run.dataset.ground_truth(answer.scene_id, answer.im_id)[answer.gt_id].T_cam_obj
+    truth = graph.context.dataset.ground_truth(answer.scene_id, answer.im_id)[answer.gt_id].T_cam_obj
     views = graph.templates.read_views(answer.obj_id, [answer.template_id])
     true = rotation_between(truth[:3, 3], np.array([0.0, 0, 1])) @ truth[:3, :3]
-    symmetric = true @ graph.run.model(answer.obj_id).symmetries[:, :3, :3]
+    symmetric = true @ graph.context.model(answer.obj_id).symmetries[:, :3, :3]
     return float(rotation_angle_deg(np.broadcast_to(views.T_cam_obj[0, :3, :3], symmetric.shape), symmetric).min())
 
 

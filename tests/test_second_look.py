@@ -76,7 +76,7 @@ def test_a_drawn_view_shows_the_object_where_the_querys_crop_would(scenes, cache
     assert drawn.rgb.shape == (size, size, 3)
     assert drawn.rgb[drawn.mask.numpy()].any(axis=1).mean() > 0.95
     assert {layer: tuple(maps.shape) for layer, maps in drawn.features.items()} == {
-        layer: made.run.stages.extract.feature_shape(layer) for layer in made.run.stages.layers
+        layer: made.context.stages.extract.feature_shape(layer) for layer in made.context.stages.layers
     }
     crop_px = camera.grid_xy(foreground(drawn.mask), width=size).double().numpy()
     points = lift(crop_px, drawn.A_crop_img, drawn.depth_mm, drawn.K, drawn.T_cam_obj)
@@ -94,7 +94,7 @@ def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes,
         answers, off = estimates(made), []
         for answer in answers:
             (true,) = [g for g in scenes.ground_truth(answer.scene_id, answer.im_id) if g.gt_id == answer.gt_id]
-            points = made.run.model(answer.obj_id).mesh.vertices
+            points = made.context.model(answer.obj_id).mesh.vertices
             moved = rigid.transform(answer.T_cam_obj, points) - rigid.transform(true.T_cam_obj, points)
             off.append(np.linalg.norm(moved, axis=1).mean() / np.ptp(points, axis=0).max())
             assert ("draw" in answer.times_s) == (looks > 0)
@@ -120,8 +120,8 @@ def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache
     behind = rigid.rigid(np.eye(3), np.array([0.0, 0.0, -500.0]))
     nothing = bank.draw(behind, query.A_crop_img, query.K)
     assert not nothing.mask.any()
-    kept = trace_pose(made.run.stages, query, replace(bank, draw=lambda *pose: nothing)).best
-    first = trace_pose(replace(made.run.stages, second_look=0), query, bank).best
+    kept = trace_pose(made.context.stages, query, replace(bank, draw=lambda *pose: nothing)).best
+    first = trace_pose(replace(made.context.stages, second_look=0), query, bank).best
     assert kept.drawn is None
     np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)
 
@@ -135,14 +135,14 @@ def test_a_side_is_clustered_once_where_the_other_has_no_say(scenes, cache, monk
     query, bank = made.poses.query(found[0])[0], made.templates.bank(found[0].detection.obj_id)
     asked, side = [], KMeans.side
     monkeypatch.setattr(KMeans, "side", lambda self, name, *maps: asked.append(name) or side(self, name, *maps))
-    trace = trace_pose(made.run.stages, query, bank)
+    trace = trace_pose(made.context.stages, query, bank)
     looks = sum(hypothesis.drawn is not None for hypothesis in trace.hypotheses)
     assert asked.count("query") == 1
     assert asked.count("template") == 3 + looks
-    trace_pose(made.run.stages, replace(query), bank)  # another query that meets the same templates
+    trace_pose(made.context.stages, replace(query), bank)  # another query that meets the same templates
     assert asked.count("query") == 2
     assert asked.count("template") == 3 + 2 * looks
-    other = replace(made.run.stages, cluster=KMeans(count=10))  # other clusters are none of those
+    other = replace(made.context.stages, cluster=KMeans(count=10))  # other clusters are none of those
     assert trace_pose(other, query, bank).best.clusters.query_label.max() == 9
     for hypothesis in trace.hypotheses:
         view = hypothesis.drawn or bank.view(hypothesis.template_id)

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 from pipeline.errors import BadInput
-from pipeline.graph.checks import doubts
+from pipeline.graph.checks import detection_warnings
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
@@ -31,8 +31,8 @@ from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.replay import Retraced, Retracer
-from pipeline.graph.scores import Judged, ScoreNodes
-from pipeline.graph.tasks import Counts, Work, Workers, use_threads
+from pipeline.graph.scores import PoseEvaluation, ScoreNodes
+from pipeline.graph.tasks import Counts, Task, Workers, use_threads
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
@@ -44,9 +44,9 @@ __all__ = [
     "Context",
     "Counts",
     "Graph",
-    "Judged",
     "Memory",
     "Node",
+    "PoseEvaluation",
     "Retraced",
     "ScoreNodes",
     "Workers",
@@ -57,18 +57,18 @@ __all__ = [
 class Graph:
     """All nodes of one run."""
 
-    def __init__(self, run: Context) -> None:
-        self.run = run
-        self.templates = TemplateNodes(run)
-        self.detections = DetectionNodes(run, proposal_nodes(run))
-        self.queries = QueryNodes(run, self.detections)
-        self.poses = PoseNodes(run, self.templates, self.queries)
+    def __init__(self, context: Context) -> None:
+        self.context = context
+        self.templates = TemplateNodes(context)
+        self.detections = DetectionNodes(context, proposal_nodes(context))
+        self.queries = QueryNodes(context, self.detections)
+        self.poses = PoseNodes(context, self.templates, self.queries)
 
     def check(self) -> None:
         """Raise BadInput for a device, weights or a layer that are not there, before any work."""
-        self.run.runtime.torch_device()
-        _ = self.run.runtime.memory_bytes, self.run.runtime.vram_bytes
-        stages = self.run.stages
+        self.context.runtime.torch_device()
+        _ = self.context.runtime.memory_bytes, self.context.runtime.vram_bytes
+        stages = self.context.stages
         if isinstance(stages.fuse, TrainedFuser):
             stages.fuse.check(stages.extract.model)
         asked = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
@@ -85,22 +85,22 @@ class Graph:
                     raise BadInput(asked[layer], found=fault.found, needed=needed) from None
                 raise
         if self.detections.proposals:
-            if where := self.run.dataset.location_field:
+            if where := self.context.dataset.location_field:
                 raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
             self.detections.proposals.check()
-        self.templates.views = fit_to_budgets(self.run, self.detections.proposals)
+        self.templates.views = fit_to_budgets(self.context, self.detections.proposals)
 
     def memory(self, *, passes: bool) -> tuple[Memory, Memory | None]:
         """What the run will take at its peak: of the machine, and of the device where that is another.
 
         ``passes``: whether any image has to go through a backbone.
         """
-        need = need_of(self.run, self.detections.proposals)
-        return memory_of(self.run, need if passes else replace(need, weights=0, footprint=None))
+        need = need_of(self.context, self.detections.proposals)
+        return memory_of(self.context, need if passes else replace(need, weights=0, footprint=None))
 
     def hold_to_vram(self) -> None:
         """What torch keeps of the device's memory for later counts against its budget as well."""
-        vram, device = self.run.runtime.vram_bytes, self.run.device
+        vram, device = self.context.runtime.vram_bytes, self.context.device
         if vram is not None and device.startswith("cuda"):
             total = torch.cuda.get_device_properties(device).total_memory
             torch.cuda.set_per_process_memory_fraction(min(1.0, vram / total), device)
@@ -110,43 +110,43 @@ class Graph:
         kinds = [self.templates.onboarding]
         if self.detections.proposals and not self.detections.known:
             kinds.append(self.detections.proposals.describing)
-        with self.run.progress.bar(len(kinds) * len(self.run.object_ids), "onboarding", "object") as advance:
-            for work in kinds:
-                self.run.each(work, self.run.object_ids, advance)
+        with self.context.progress.bar(len(kinds) * len(self.context.object_ids), "onboarding", "object") as advance:
+            for task in kinds:
+                self.context.run_task(task, self.context.object_ids, advance)
 
     def do(self, work: str, unit: Any) -> Counts:
         """One unit of a kind of work, for whoever asks for it by name; returns what was computed for it."""
-        before: list[Work[Any]] = [self.templates.onboarding]
+        before: list[Task[Any]] = [self.templates.onboarding]
         if self.detections.proposals:
             before += [self.detections.proposals.describing, self.detections.proposals.proposing_all]
-        after: list[Work[Any]] = [self.queries.describing, self.poses.solving]
+        after: list[Task[Any]] = [self.queries.describing, self.poses.solving]
         if work in [kind.name for kind in after]:
             self.detect()
-        self.run.progress.counts.clear()
+        self.context.progress.counts.clear()
         next(kind for kind in before + after if kind.name == work).do(unit, lambda rows: None)
-        return dict(self.run.progress.counts)
+        return dict(self.context.progress.counts)
 
     def detect(self) -> list[Detection]:
         """Detections of all targets, those that cannot be used included."""
         return self.detections.all
 
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What is odd about the detections, a line each."""
-        return doubts(self.run, self.detect())
+        return detection_warnings(self.context, self.detect())
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
         self.detect()  # first: a fault in its files must not wait for hours of onboarding
-        if not self.run.store.is_complete(self.poses.run_ref()):
-            for obj_id in self.run.object_ids:
-                self.run.model(obj_id)  # nor must a mesh that does not fit its annotations
+        if not self.context.store.is_complete(self.poses.run_ref()):
+            for obj_id in self.context.object_ids:
+                self.context.model(obj_id)  # nor must a mesh that does not fit its annotations
         self.onboard()
         return self.poses.estimate()
 
     def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
         """The node of the poses' scores, and with them those of the correspondences they were solved from."""
         retrace = self.retracer() if correspondences else None
-        return ScoreNodes(self.run, self.templates, self.poses, scorer, retrace)
+        return ScoreNodes(self.context, self.templates, self.poses, scorer, retrace)
 
     def retracer(self) -> Retracer:
         """Shows how answers came about."""
@@ -158,4 +158,4 @@ class Graph:
 
     def planned(self) -> Iterator[Node]:
         """The nodes of a plan one by one. Raises NotDownloaded where weights decide that are not here."""
-        return Plan(self.run, self.templates, self.queries, self.poses, self.detections).nodes()
+        return Plan(self.context, self.templates, self.queries, self.poses, self.detections).nodes()

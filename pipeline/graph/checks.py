@@ -16,34 +16,34 @@ HALF = 0.5  # of the image: one that also reaches all four sides is often the ba
 OUTSIDE = 0.1  # of a box beyond the image: often two corners instead of a corner, width and height
 
 
-def doubts(run: Context, detections: Sequence[Detection]) -> list[str]:
+def detection_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
     """One line for each detection that is odd, and for each camera whose poses nothing vouches for."""
     found = []
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
-        if not run.dataset.has_ground_truth(scene_id) and (why := _camera_doubt(run, (scene_id, im_id))):
+        if not context.dataset.has_ground_truth(scene_id) and (why := _camera_doubt(context, (scene_id, im_id))):
             found.append(f"scene {scene_id}, image {im_id}: {why}")
     for d in detections:
-        if d.defect is None and (why := _doubt(run, d)):
+        if d.defect is None and (why := _doubt(context, d)):
             found.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {why}")
     return found
 
 
-def _camera_doubt(run: Context, image: ImageId) -> str:
-    (h, w), (cx, cy) = run.dataset.image_size(*image), run.K(image)[:2, 2]
+def _camera_doubt(context: Context, image: ImageId) -> str:
+    (h, w), (cx, cy) = context.dataset.image_size(*image), context.K(image)[:2, 2]
     if 0 <= cx <= w and 0 <= cy <= h:
         return ""
     where = f"({cx:g}, {cy:g}) lies outside the image of {w} x {h} (width x height)"
     return f"K's principal point {where}; is it the K of this image at this size?"
 
 
-def _doubt(run: Context, d: Detection) -> str:
-    h, w = run.dataset.image_size(d.scene_id, d.im_id)
+def _doubt(context: Context, d: Detection) -> str:
+    h, w = context.dataset.image_size(d.scene_id, d.im_id)
     round_all = False
     if d.rle is None:
         x0, y0, x1, y1 = np.clip(d.bbox_xyxy, -0.5, (w - 0.5, h - 0.5, w - 0.5, h - 0.5))
         px, what = float(max(x1 - x0, 0) * max(y1 - y0, 0)), "box"
         left, top, right, bottom = d.bbox_xyxy
-        if run.dataset.given_bbox_xyxy and px < (1 - OUTSIDE) * (right - left) * (bottom - top):
+        if context.dataset.given_bbox_xyxy and px < (1 - OUTSIDE) * (right - left) * (bottom - top):
             share = 1 - px / ((right - left) * (bottom - top))
             return f"{share:.0%} of the box lies outside the image; is it x, y, width, height, and not two corners?"
     else:

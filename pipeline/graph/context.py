@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from pipeline.bop.dataset import Dataset
 from pipeline.errors import BadInput, DzopError
-from pipeline.graph.lru import Kept
-from pipeline.graph.tasks import Advance, Unit, Work, Workers
-from pipeline.graph.timings import Rates, work_of
+from pipeline.graph.lru import LRUCache
+from pipeline.graph.tasks import Advance, Item, Task, Workers
+from pipeline.graph.timings import Timings, timing_key
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crops, Target
 from pipeline.progress import Progress
@@ -32,7 +32,10 @@ ImageId = tuple[int, int]
 
 @dataclass(eq=False)
 class Context:
-    """One run: its stages, data, store and progress. ``workers``: who does its work, None for this process alone."""
+    """What all nodes of one run share: stages, data, store and step counts.
+
+    ``workers`` run tasks in other processes; None runs everything in this one.
+    """
 
     stages: Stages
     dataset: Dataset
@@ -41,38 +44,46 @@ class Context:
     runtime: Runtime
     progress: Progress = field(default_factory=Progress)
     workers: Workers | None = None
+    _mesh_digests: dict[int, str] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def object_ids(self) -> list[int]:
-        """Objects of the targets."""
+        """Ids of the targets' objects, sorted."""
         return sorted({target.obj_id for target in self.targets})
 
     @cached_property
     def image_ids(self) -> list[ImageId]:
-        """Images of the targets."""
+        """Ids of the targets' images, sorted."""
         return sorted({(target.scene_id, target.im_id) for target in self.targets})
 
-    @cached_property
-    def model(self) -> Kept[int, ObjectModel]:
-        """An object's mesh; the last ones stay in memory, so that it does not grow with the number of objects."""
-        return Kept(self._model, _mesh_bytes, MESHES_BYTES)
+    # --- loaded once -------------------------------------------------------------------------------------------------
 
-    def _model(self, obj_id: int) -> ObjectModel:
+    @cached_property
+    def models(self) -> LRUCache[int, ObjectModel]:
+        """Meshes in memory, bounded so that memory does not grow with the number of objects."""
+        return LRUCache(self._read_model, _mesh_bytes, MESHES_BYTES)
+
+    def model(self, obj_id: int) -> ObjectModel:
+        """Mesh and symmetries of an object."""
+        return self.models(obj_id)
+
+    def _read_model(self, obj_id: int) -> ObjectModel:
         model = self.dataset.object_model(obj_id)
         if model.mesh.digest != self.mesh_digest(obj_id):
-            found = "other bytes than when its key was made"
-            raise BadInput(self.dataset.model_path(obj_id), found=found, needed="a mesh that no one writes meanwhile")
+            found = "a file that changed while the run was reading it"
+            raise BadInput(self.dataset.model_path(obj_id), found=found, needed="a mesh that no one writes to")
         return model
 
-    @cached_property
-    def mesh_digest(self) -> Callable[[int], str]:
-        """Digest of an object's mesh, which keys are made from; the mesh itself is read where something is computed."""
-        return lru_cache(maxsize=None)(self.dataset.mesh_digest)
+    def mesh_digest(self, obj_id: int) -> str:
+        """Digest of an object's mesh file, from which keys are made without parsing the mesh."""
+        if obj_id not in self._mesh_digests:
+            self._mesh_digests[obj_id] = self.dataset.mesh_digest(obj_id)
+        return self._mesh_digests[obj_id]
 
     @cached_property
-    def rates(self) -> Rates:
-        """Seconds of rows as they were measured on this machine."""
-        return Rates(self.store.backend.folder, self.device)
+    def timings(self) -> Timings:
+        """Seconds per row measured on this machine."""
+        return Timings(self.store.backend.folder, self.device)
 
     @cached_property
     def backbone(self) -> Backbone:
@@ -81,28 +92,33 @@ class Context:
 
     @cached_property
     def device(self) -> str:
-        """Where tensors live."""
+        """Torch name of the device that holds tensors."""
         return self.runtime.torch_device()
 
     def K(self, image: ImageId) -> Float[np.ndarray, "3 3"]:
-        """Camera matrix of an image."""
+        """Camera matrix of an image, px."""
         return self.dataset.K(*image)
 
     def tensor(self, values: np.ndarray) -> torch.Tensor:
-        """Stored values on the device."""
+        """Copy an array to the device."""
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
-    def each(self, work: Work[Unit], units: Sequence[Unit], advance: Advance) -> None:
-        """Do every unit of work, here or by the run's workers; what is there already never leaves this process."""
-        away = [] if self.workers is None else [unit for unit in units if not work.done(unit)]
-        for unit in units if not away else set(units).difference(away):
-            work.do(unit, advance)
-        for unit, counts in self.workers.each(work.name, away) if self.workers and away else ():
+    # --- tasks -------------------------------------------------------------------------------------------------------
+
+    def run_task(self, task: Task[Item], items: Sequence[Item], advance: Advance) -> None:
+        """Run a task for every item, here or in the workers. Items that are complete are never sent to a worker."""
+        workers = self.workers
+        remote = [] if workers is None else [item for item in items if not task.done(item)]
+        for item in set(items).difference(remote) if remote else items:
+            task.do(item, advance)
+        if workers is None or not remote:
+            return
+        for item, counts in workers.map(task.name, remote):
             self.progress.merge(counts)
-            if not work.done(unit):
-                found = f"that a worker has finished {work.name} of {unit}, and nothing of it in {self.store.place}"
-                raise BadInput("runtime", found=found, needed="workers that see the same files and the same store")
-            advance(work.size(unit))
+            if not task.done(item):
+                found = f"{task.name} of {item} reported done by a worker, but missing in {self.store.place}"
+                raise BadInput("runtime", found=found, needed="workers that share the run's files and store")
+            advance(task.size(item))
 
     # --- entries of one kind -----------------------------------------------------------------------------------------
 
@@ -136,11 +152,12 @@ class Context:
         batch: int,
         compute: Callable[[list[int]], Any],
         document: Mapping[str, Any] | None = None,
-        work: str = "",
+        timing: str = "",
     ) -> None:
-        """Fill entries and count them, with a bar when the step has a title of its own.
+        """Compute the missing rows of entries and count them under ``step``.
 
-        ``work``: what decides the seconds of a row, for plans; "" where nobody asks.
+        ``title`` is the text of a progress bar, "" for none. ``timing`` is the key under which the seconds per row
+        are saved for plans, "" to save none.
         """
         if all(self.store.is_complete(ref) for ref in refs):
             self.progress.add(step, reused=rows)
@@ -148,13 +165,13 @@ class Context:
         with self.progress.bar(rows, title, "row") as advance:
             filled = self.store.fill(refs, rows=rows, batch=batch, compute=compute, document=document, advance=advance)
         self.progress.add(step, computed=filled.computed, reused=filled.reused, time_s=filled.time_s)
-        if work and filled.computed:
-            self.rates.note(work, filled.computed, filled.time_s)
+        if timing and filled.computed:
+            self.timings.add(timing, filled.computed, filled.time_s)
 
     def extract(
         self, step: str, title: str, refs: Mapping[int, Ref], rows: int, crops: Callable[[list[int]], Crops]
     ) -> None:
-        """Features of the layers that are missing, in as few passes as possible: one for all of them."""
+        """Extract the layers that are missing, all of them in one pass. ``crops`` reads the crops of some rows."""
         missing = {layer: ref for layer, ref in refs.items() if not self.store.is_complete(ref)}
         if not missing:
             self.progress.add(step, reused=rows)
@@ -165,9 +182,9 @@ class Context:
             return {ref.key: {"maps": maps[layer]} for layer, ref in missing.items()}
 
         layouts = {ref: self.features_layout(layer) for layer, ref in missing.items()}
-        batch = self.backbone.batch  # loads the weights: their seconds are no part of a row's
-        work = work_of("features", self.stages, list(missing))
-        self.fill(step, title, layouts, rows, self.runtime.batch or batch, compute, work=work)
+        batch = self.backbone.batch  # loads the weights now, so that a row's seconds do not include it
+        timing = timing_key("features", self.stages, list(missing))
+        self.fill(step, title, layouts, rows, self.runtime.batch or batch, compute, timing=timing)
 
     def maps(self, crops: Crops, layers: Sequence[int]) -> dict[int, np.ndarray]:
         """Feature maps of crops as they are stored: float16, on the CPU."""
@@ -175,7 +192,7 @@ class Context:
         return {layer: _half(maps[layer], layer) for layer in layers}
 
 
-def stacked(crops: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
+def stack_crops(crops: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
     """Rows of a crops entry from what the crop stage returns."""
     rgb, mask, A_crop_img = (np.stack(parts) for parts in zip(*crops, strict=True))
     return {"rgb": rgb, "mask": mask, "A_crop_img": A_crop_img}

@@ -20,45 +20,47 @@ from pipeline.store import Ref, make_ref
 class DetectionNodes:
     """The entry of a run's detections. ``proposals``: what a detector that describes stands on, None for others."""
 
-    run: Context
+    context: Context
     proposals: ProposalNodes | None
 
     @cached_property
     def ref(self) -> Ref:
         """All detections of the targets."""
-        recipe = {"kind": "detections", "detect": self.run.stages.detect.recipe()}
-        targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.run.targets]
+        recipe = {"kind": "detections", "detect": self.context.stages.detect.recipe()}
+        targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.context.targets]
         return make_ref("detections", recipe, self._sources() | {"targets": self._asked(targets)})
 
     def _asked(self, targets: list[list[int]]) -> str:
-        return digest([targets, None if self.proposals else self.run.dataset.given_bbox_xyxy])
+        return digest([targets, None if self.proposals else self.context.dataset.given_bbox_xyxy])
 
     def _sources(self) -> dict[str, str]:
         """What decides the answer beside the targets."""
-        detect, root = self.run.stages.detect, self.run.dataset.root
+        detect, root = self.context.stages.detect, self.context.dataset.root
         if not isinstance(detect, DescribingDetector):
-            files = detect.sources(self.run.dataset, self.run.targets)
+            files = detect.sources(self.context.dataset, self.context.targets)
             named = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
             return {"sources": files_digest(named)}
         assert self.proposals is not None
-        objects = {f"object {obj_id}": self.proposals.template_features(obj_id).key for obj_id in self.run.object_ids}
-        images = {f"image {s}/{i}": self.proposals.features((s, i)).key for s, i in self.run.image_ids}
+        objects = {
+            f"object {obj_id}": self.proposals.template_features(obj_id).key for obj_id in self.context.object_ids
+        }
+        images = {f"image {s}/{i}": self.proposals.features((s, i)).key for s, i in self.context.image_ids}
         return objects | images
 
     @property
     def known(self) -> bool:
         """Whether they can be had without proposing or describing anything."""
-        return self.proposals is None or self.run.store.is_complete(self.ref)
+        return self.proposals is None or self.context.store.is_complete(self.ref)
 
     @cached_property
     def all(self) -> list[Detection]:
         """Detections of the targets, made once."""
-        fresh = not self.run.store.is_complete(self.ref)
+        fresh = not self.context.store.is_complete(self.ref)
         if fresh:
             found = self._find()
-            self.run.store.put_document(self.ref, [detection_to_record(d) for d in found], rows=len(found))
-        found = [detection_from_record(record) for record in self.run.store.read(self.ref).document]
-        self.run.progress.add("detections", **{"computed" if fresh else "reused": len(found)})
+            self.context.store.put_document(self.ref, [detection_to_record(d) for d in found], rows=len(found))
+        found = [detection_from_record(record) for record in self.context.store.read(self.ref).document]
+        self.context.progress.add("detections", **{"computed" if fresh else "reused": len(found)})
         return found
 
     def identity(self, detection: Detection) -> dict[str, Any]:
@@ -67,18 +69,18 @@ class DetectionNodes:
         return record | {"time_s": 0.0} if self.proposals else record
 
     def _find(self) -> list[Detection]:
-        detect = self.run.stages.detect
+        detect = self.context.stages.detect
         if not isinstance(detect, DescribingDetector):
-            return detect(self.run.dataset, self.run.targets)
+            return detect(self.context.dataset, self.context.targets)
         assert self.proposals is not None
-        with self.run.progress.bar(len(self.run.object_ids), "descriptions", "object") as advance:
-            self.run.each(self.proposals.describing, self.run.object_ids, advance)
-        templates = {obj_id: self.proposals.template_descriptors(obj_id) for obj_id in self.run.object_ids}
+        with self.context.progress.bar(len(self.context.object_ids), "descriptions", "object") as advance:
+            self.context.run_task(self.proposals.describing, self.context.object_ids, advance)
+        templates = {obj_id: self.proposals.template_descriptors(obj_id) for obj_id in self.context.object_ids}
         found: list[Detection] = []
-        with self.run.progress.bar(len(self.run.image_ids), "proposals", "image") as advance:
-            self.run.each(self.proposals.proposing_all, self.run.image_ids, advance)
-        for image in self.run.image_ids:
-            targets = [t for t in self.run.targets if (t.scene_id, t.im_id) == image]
+        with self.context.progress.bar(len(self.context.image_ids), "proposals", "image") as advance:
+            self.context.run_task(self.proposals.proposing_all, self.context.image_ids, advance)
+        for image in self.context.image_ids:
+            targets = [t for t in self.context.targets if (t.scene_id, t.im_id) == image]
             described = self.proposals.described(image)
             found += detect.by_description(targets, *described, templates, self.proposals.time_s(image))
         return found

@@ -1,4 +1,4 @@
-"""Values that are dear to make and too large to keep all of: the last used ones, within a number of bytes."""
+"""LRU cache bounded by bytes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ V = TypeVar("V")
 
 
 @dataclass(eq=False)
-class Kept(Generic[K, V]):
-    """``make`` of a key, made anew where it was let go: the last is always kept, others while all fit ``limit``."""
+class LRUCache(Generic[K, V]):
+    """LRU cache bounded by bytes; the newest entry is never evicted.
+
+    ``make`` computes the value of a missing key, ``size`` returns the bytes of a value, ``limit`` is in bytes.
+    """
 
     make: Callable[[K], V]
     size: Callable[[V], int]
@@ -21,7 +24,7 @@ class Kept(Generic[K, V]):
     values: OrderedDict[K, V] = field(default_factory=OrderedDict)
 
     def __call__(self, key: K) -> V:
-        """The value of a key."""
+        """Value of a key, computed if it is missing."""
         if key not in self.values:
             self.values[key] = self.make(key)
         self.values.move_to_end(key)
@@ -29,6 +32,6 @@ class Kept(Generic[K, V]):
             self.values.popitem(last=False)
         return self.values[key]
 
-    def forget(self, key: K) -> None:
-        """Let a value go."""
+    def discard(self, key: K) -> None:
+        """Remove a key if it is present."""
         self.values.pop(key, None)

@@ -92,10 +92,10 @@ class Need:
     unknown: tuple[str, ...] = field(default_factory=tuple)
 
 
-def need_of(run: Context, described: ProposalNodes | None) -> Need:
+def need_of(context: Context, described: ProposalNodes | None) -> Need:
     """Of the object with most templates, in bytes."""
-    stages = run.stages
-    _, T_cam_obj, (h, w) = stages.render.cameras(run.model(run.object_ids[0]).mesh)
+    stages = context.stages
+    _, T_cam_obj, (h, w) = stages.render.cameras(context.model(context.object_ids[0]).mesh)
     n, size = len(T_cam_obj), stages.crop.size
     shapes = {layer: stages.extract.feature_shape(layer) for layer in stages.layers}
     values = {layer: c * rows * columns for layer, (c, rows, columns) in shapes.items()}
@@ -108,7 +108,7 @@ def need_of(run: Context, described: ProposalNodes | None) -> Need:
         bank = 0
     else:
         bank = n * (2 * values[stages.match.layer] + crop + 24 * cells[stages.match.layer])
-    footprint, weights, unknown = _extracting(run, described)
+    footprint, weights, unknown = _extracting(context, described)
     return Need(
         rows=n,
         weights=weights,
@@ -124,12 +124,12 @@ def need_of(run: Context, described: ProposalNodes | None) -> Need:
     )  # fmt: skip
 
 
-def _extracting(run: Context, described: ProposalNodes | None) -> tuple[Footprint | None, int, tuple[str, ...]]:
+def _extracting(context: Context, described: ProposalNodes | None) -> tuple[Footprint | None, int, tuple[str, ...]]:
     """The larger pass, the weights of all models, and whose size nobody knows."""
-    asked = [(run, run.stages.layers)]
-    if described is not None and described.run is not run:
-        asked.append((described.run, (described.detector.describe_layer,)))
-    device = torch.device(run.device).type
+    asked = [(context, context.stages.layers)]
+    if described is not None and described.context is not context:
+        asked.append((described.context, (described.detector.describe_layer,)))
+    device = torch.device(context.device).type
     found, unknown = [], []
     for context, layers in asked:
         extract = context.stages.extract
@@ -144,17 +144,17 @@ def _extracting(run: Context, described: ProposalNodes | None) -> tuple[Footprin
     return max(found, key=lambda f: f.a_pass + f.a_crop, default=None), weights, tuple(unknown)
 
 
-def memory_of(run: Context, need: Need, *, least: bool = False) -> tuple[Memory, Memory | None]:
+def memory_of(context: Context, need: Need, *, least: bool = False) -> tuple[Memory, Memory | None]:
     """Of the machine, and of the device where it is another. ``least``: with the smallest batch and one view kept."""
-    device = torch.device(run.device)
+    device = torch.device(context.device)
     process = psutil.Process().memory_info().rss
-    batch, a_batch = run.runtime.batch or 1, 0
+    batch, a_batch = context.runtime.batch or 1, 0
     if need.footprint is not None:
         if not least:
-            batch = run.runtime.batch or fitting_batch(need.footprint, run.runtime, device, ahead=need.weights)
+            batch = context.runtime.batch or fitting_batch(need.footprint, context.runtime, device, ahead=need.weights)
         batch = min(batch, need.rows)
         a_batch = need.footprint.a_pass + batch * need.footprint.a_crop
-    views = 1 if least else views_kept(run, need)
+    views = 1 if least else views_kept(context, need)
     bank = need.bank + need.online + views * need.view
     if need.look and need.footprint is not None:  # a pass while the templates are there
         bank += need.look + need.footprint.a_pass + need.footprint.a_crop
@@ -167,10 +167,10 @@ def memory_of(run: Context, need: Need, *, least: bool = False) -> tuple[Memory,
     return Memory({"the process": process}, drawing | passing, unknown), on_device
 
 
-def views_kept(run: Context, need: Need) -> int:
+def views_kept(context: Context, need: Need) -> int:
     """How many whole templates of an object are kept at a time."""
-    on_cpu = run.device == "cpu"
-    limit = run.runtime.memory_bytes if on_cpu else run.runtime.vram_bytes
+    on_cpu = context.device == "cpu"
+    limit = context.runtime.memory_bytes if on_cpu else context.runtime.vram_bytes
     if limit is None:
         return VIEWS_MOST
     taken = need.weights + need.bank + need.online + (psutil.Process().memory_info().rss if on_cpu else 0)
@@ -178,17 +178,17 @@ def views_kept(run: Context, need: Need) -> int:
     return max(1, min(VIEWS_MOST, room // max(1, need.view)))
 
 
-def fit_to_budgets(run: Context, described: ProposalNodes | None) -> int:
+def fit_to_budgets(context: Context, described: ProposalNodes | None) -> int:
     """Whole templates that may be kept of an object: VIEWS_MOST, fewer where a budget or their size says so.
 
     Raises BadInput for a run that cannot fit its budgets whatever its batch, before anything is spent.
     """
-    memory, vram = run.runtime.memory_bytes, run.runtime.vram_bytes
+    memory, vram = context.runtime.memory_bytes, context.runtime.vram_bytes
     if memory is None and vram is None:
         return VIEWS_MOST
-    need = need_of(run, described)
-    host, on_device = memory_of(run, need, least=True)
-    host.check(memory, "runtime.max_memory", run.runtime.max_memory)
+    need = need_of(context, described)
+    host, on_device = memory_of(context, need, least=True)
+    host.check(memory, "runtime.max_memory", context.runtime.max_memory)
     if on_device is not None:
-        on_device.check(vram, "runtime.max_vram", run.runtime.max_vram)
-    return views_kept(run, need)
+        on_device.check(vram, "runtime.max_vram", context.runtime.max_vram)
+    return views_kept(context, need)

@@ -10,9 +10,9 @@ from functools import cached_property, lru_cache
 from pipeline.errors import NoPose
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import Found, QueryNodes
-from pipeline.graph.tasks import Advance, Work
+from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import StoredBank, TemplateNodes
-from pipeline.graph.timings import work_of
+from pipeline.graph.timings import timing_key
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
@@ -27,7 +27,7 @@ POSES_VERSION = 2
 class PoseNodes:
     """Entries of poses. Methods without a verb name entries; ``estimate`` computes what is missing."""
 
-    run: Context
+    context: Context
     templates: TemplateNodes
     queries: QueryNodes
 
@@ -35,7 +35,7 @@ class PoseNodes:
     def groups(self) -> dict[tuple[int, int], list[Target]]:
         """Targets by scene and object: the poses of one group are one entry."""
         grouped: dict[tuple[int, int], list[Target]] = {}
-        for target in self.run.targets:
+        for target in self.context.targets:
             grouped.setdefault((target.scene_id, target.obj_id), []).append(target)
         return dict(sorted(grouped.items()))
 
@@ -45,7 +45,7 @@ class PoseNodes:
         return lru_cache(maxsize=None)(self._poses)
 
     def _poses(self, group: tuple[int, int]) -> Ref:
-        stages, (_, obj_id) = self.run.stages, group
+        stages, (_, obj_id) = self.context.stages, group
         recipe = {"kind": "poses", "version": POSES_VERSION, "fallback": stages.fallback}
         recipe |= {name: getattr(stages, name).recipe() for name in ONLINE_STAGES}
         if stages.second_look:  # what it draws and extracts with is in the keys of the templates and their features
@@ -57,11 +57,11 @@ class PoseNodes:
             inputs[f"fit {n}"] = self.templates.fitted(obj_id, fit).key
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
-            asked = [target.inst_count, self.run.K(image).tolist()]
+            asked = [target.inst_count, self.context.K(image).tolist()]
             asked += [self.queries.detecting.identity(d) for _, d in self._detections(target)]
             if stages.need_truth:
                 asked += [self._truth(d).T_cam_obj.tolist() for _, d in self._detections(target)]
-                asked += [self.run.model(obj_id).symmetries.tolist()]
+                asked += [self.context.model(obj_id).symmetries.tolist()]
             features = [self.queries.features(image, layer).key for layer in stages.layers]
             inputs[f"image {target.im_id}"] = digest([asked, self.queries.crops(image).key, features])
         return make_ref("poses", recipe, inputs)
@@ -73,38 +73,38 @@ class PoseNodes:
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target and for every target without one."""
         ref = self.run_ref()
-        if not self.run.store.is_complete(ref):
+        if not self.context.store.is_complete(ref):
             self._make(ref)
-        answers = [answer_from_record(record) for record in self.run.store.read(ref).document["answers"]]
+        answers = [answer_from_record(record) for record in self.context.store.read(ref).document["answers"]]
         self._count_reused(len(answers))
         return answers
 
     def _make(self, ref: Ref) -> None:
-        missing = [group for group in self.groups if not self.run.store.is_complete(self.poses(group))]
+        missing = [group for group in self.groups if not self.context.store.is_complete(self.poses(group))]
         self._make_queries(sorted({(t.scene_id, t.im_id) for group in missing for t in self.groups[group]}))
         total = sum(len(self.groups[group]) for group in missing)
-        with self.run.progress.bar(total, "poses", "target") as advance:
-            self.run.each(self.solving, sorted(missing, key=lambda group: group[1]), advance)
-        made = [self.run.store.read(self.poses(group)).document["answers"] for group in self.groups]
+        with self.context.progress.bar(total, "poses", "target") as advance:
+            self.context.run_task(self.solving, sorted(missing, key=lambda group: group[1]), advance)
+        made = [self.context.store.read(self.poses(group)).document["answers"] for group in self.groups]
         records = [record for answers in made for record in answers]
-        self.run.store.put_document(ref, {"answers": records}, rows=len(records))
+        self.context.store.put_document(ref, {"answers": records}, rows=len(records))
 
     def _make_queries(self, images: Sequence[ImageId]) -> None:
-        with self.run.progress.bar(len(images), "query features", "image") as advance:
-            self.run.each(self.queries.describing, images, advance)
+        with self.context.progress.bar(len(images), "query features", "image") as advance:
+            self.context.run_task(self.queries.describing, images, advance)
 
     def _count_reused(self, answers: int) -> None:
         """Whatever this run stands on and did not compute was reused."""
         usable = sum(len(found) for found in self.queries.of_image.values())
         for step, rows in (("query crops", usable), ("query features", usable), ("poses", answers)):
-            count = self.run.progress.step(step)
-            self.run.progress.add(step, reused=max(0, rows - count.computed - count.reused))
+            count = self.context.progress.step(step)
+            self.context.progress.add(step, reused=max(0, rows - count.computed - count.reused))
 
     @cached_property
-    def solving(self) -> Work[tuple[int, int]]:
+    def solving(self) -> Task[tuple[int, int]]:
         """Poses, by scene and object."""
-        done, size = self.run.store.is_complete, self.groups
-        return Work("poses", self._solve, lambda group: done(self.poses(group)), lambda group: len(size[group]))
+        done, size = self.context.store.is_complete, self.groups
+        return Task("poses", self._solve, lambda group: done(self.poses(group)), lambda group: len(size[group]))
 
     def _solve(self, group: tuple[int, int], advance: Advance) -> None:
         ref, (_, obj_id) = self.poses(group), group
@@ -115,11 +115,11 @@ class PoseNodes:
             advance(1)
         seconds = sum(sum(a.times_s.values()) for a in answers if isinstance(a, PoseEstimate))
         document = {"answers": [answer_to_record(answer) for answer in answers]}
-        self.run.store.put_document(ref, document, rows=len(answers), time_s=seconds)
-        self.run.progress.add("poses", computed=len(answers), time_s=seconds)
-        templates = self.run.store.read(self.templates.templates(obj_id)).rows
-        work = work_of("poses", self.run.stages, rows=templates)
-        self.run.rates.note(work, len(self.groups[group]), time.perf_counter() - began)
+        self.context.store.put_document(ref, document, rows=len(answers), time_s=seconds)
+        self.context.progress.add("poses", computed=len(answers), time_s=seconds)
+        templates = self.context.store.read(self.templates.templates(obj_id)).rows
+        work = timing_key("poses", self.context.stages, rows=templates)
+        self.context.timings.add(work, len(self.groups[group]), time.perf_counter() - began)
 
     def _detections(self, target: Target) -> list[tuple[int, Detection]]:
         return self.queries.of_target.get((target.scene_id, target.im_id, target.obj_id), [])
@@ -141,7 +141,7 @@ class PoseNodes:
             if found is None:
                 raise NoPose("crop", self.queries.crop_failure(index, d))
             query, shared_s = self.query(found)
-            trace = trace_pose(self.run.stages, query, bank)
+            trace = trace_pose(self.context.stages, query, bank)
             template_id = trace.best.template_id
             return self._estimate(nth, d, query, trace, bank, shared_s)
         except NoPose as failure:
@@ -150,13 +150,13 @@ class PoseNodes:
     def query(self, found: Found) -> tuple[Query, dict[str, float]]:
         """A detection as the online route reads it, with the truth for an oracle alone; its share of the seconds."""
         query, shared_s = self.queries.query(found)
-        if self.run.stages.need_truth:
+        if self.context.stages.need_truth:
             query = replace(query, truth=self._truth(found.detection))
         return query, shared_s
 
     def _truth(self, d: Detection) -> Truth:
-        T_cam_obj = self.queries.true_pose(d, asked_by=self.run.stages.need_truth)
-        return Truth(T_cam_obj, self.run.model(d.obj_id).symmetries)
+        T_cam_obj = self.queries.true_pose(d, asked_by=self.context.stages.need_truth)
+        return Truth(T_cam_obj, self.context.model(d.obj_id).symmetries)
 
     def _estimate(
         self, nth: int, d: Detection, query: Query, trace: Trace, bank: StoredBank, shared_s: Mapping[str, float]
@@ -164,7 +164,7 @@ class PoseNodes:
         best, matches = trace.best, trace.best.matches
         if best.solution is not None:
             T_cam_obj, fallback = best.solution.T_cam_obj, ""
-        elif self.run.stages.fallback:
+        elif self.context.stages.fallback:
             T_cam_obj = template_pose(query, bank.view(best.template_id))
             fallback = f"rotation of template {best.template_id}, scale of the crop ({best.failure})"
         else:

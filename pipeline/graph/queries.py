@@ -12,10 +12,10 @@ import numpy as np
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
-from pipeline.graph.context import Context, ImageId, stacked
+from pipeline.graph.context import Context, ImageId, stack_crops
 from pipeline.graph.detections import DetectionNodes
-from pipeline.graph.tasks import Advance, Work
-from pipeline.graph.timings import work_of
+from pipeline.graph.tasks import Advance, Task
+from pipeline.graph.timings import timing_key
 from pipeline.io.digests import file_digest
 from pipeline.items.views import Crops, Detection, Geometry
 from pipeline.route import Query
@@ -37,7 +37,7 @@ class Found:
 class QueryNodes:
     """Entries of images. Methods without a verb name entries; ``make_*`` compute what is missing."""
 
-    run: Context
+    context: Context
     detecting: DetectionNodes
 
     @property
@@ -56,7 +56,7 @@ class QueryNodes:
     @cached_property
     def of_image(self) -> dict[ImageId, list[tuple[int, Detection]]]:
         """Usable detections of each image with their index, in order."""
-        grouped: dict[ImageId, list[tuple[int, Detection]]] = {image: [] for image in self.run.image_ids}
+        grouped: dict[ImageId, list[tuple[int, Detection]]] = {image: [] for image in self.context.image_ids}
         for index, detection in enumerate(self.detections):
             if detection.defect is None:
                 grouped[detection.scene_id, detection.im_id].append((index, detection))
@@ -69,32 +69,33 @@ class QueryNodes:
 
     def _crops(self, image: ImageId) -> Ref:
         shown = [[d.obj_id, list(d.bbox_xyxy), d.rle] for _, d in self.of_image[image]]
-        recipe = {"kind": "query crops", "crop": self.run.stages.crop.recipe()}
-        inputs = {"image": file_digest(self.run.dataset.image_path(*image)), "detections": digest(shown)}
-        if self.run.stages.crop.needs_camera:
-            inputs["camera"] = digest(self.run.K(image).tolist())
+        recipe = {"kind": "query crops", "crop": self.context.stages.crop.recipe()}
+        inputs = {"image": file_digest(self.context.dataset.image_path(*image)), "detections": digest(shown)}
+        if self.context.stages.crop.needs_camera:
+            inputs["camera"] = digest(self.context.K(image).tolist())
         return make_ref("crops", recipe, inputs)
 
     def features(self, image: ImageId, layer: int) -> Ref:
         """Features of an image's detections, one layer."""
         inputs = {"crops": self.crops(image).key}
-        if self.run.stages.extract.needs_geometry:
+        if self.context.stages.extract.needs_geometry:
             poses = [
-                [d.obj_id, self.run.mesh_digest(d.obj_id), self.true_pose(d).tolist()] for _, d in self.of_image[image]
+                [d.obj_id, self.context.mesh_digest(d.obj_id), self.true_pose(d).tolist()]
+                for _, d in self.of_image[image]
             ]
-            inputs["geometry"] = digest([poses, self.run.K(image).tolist()])
-        return self.run.features(layer, inputs)
+            inputs["geometry"] = digest([poses, self.context.K(image).tolist()])
+        return self.context.features(layer, inputs)
 
     @cached_property
-    def describing(self) -> Work[ImageId]:
+    def describing(self) -> Task[ImageId]:
         """Crops and features of an image's detections, by image."""
-        return Work("query features", self._describe, self._described)
+        return Task("query features", self._describe, self._described)
 
     def _described(self, image: ImageId) -> bool:
-        complete = self.run.store.is_complete
+        complete = self.context.store.is_complete
         if not complete(self.crops(image)):
             return False
-        layers = self.run.stages.layers
+        layers = self.context.stages.layers
         return not self.found(image) or all(complete(self.features(image, layer)) for layer in layers)
 
     def _describe(self, image: ImageId, advance: Advance) -> None:
@@ -104,32 +105,36 @@ class QueryNodes:
     def make_crops(self, image: ImageId) -> list[Found]:
         """Crop an image's detections; those that cannot be cropped are left out, with their reason."""
         ref = self.crops(image)
-        if self.run.store.is_complete(ref):
-            self.run.progress.add("query crops", reused=self.run.store.read(ref).rows)
+        if self.context.store.is_complete(ref):
+            self.context.progress.add("query crops", reused=self.context.store.read(ref).rows)
             return self.found(image)
         began = time.perf_counter()
         crops, document = self._cropped(image)
         if not crops:
-            self.run.store.put_document(ref, document, rows=0)
+            self.context.store.put_document(ref, document, rows=0)
             return []
-        arrays = stacked(crops)
+        arrays = stack_crops(crops)
 
         def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
             return {ref.key: {name: values[rows] for name, values in arrays.items()}}
 
-        self.run.fill("query crops", "", {ref: self.run.crops_layout()}, len(crops), len(crops), compute, document)
-        self.run.rates.note(work_of("query crops", self.run.stages), len(crops), time.perf_counter() - began)
+        self.context.fill(
+            "query crops", "", {ref: self.context.crops_layout()}, len(crops), len(crops), compute, document
+        )
+        self.context.timings.add(
+            timing_key("query crops", self.context.stages), len(crops), time.perf_counter() - began
+        )
         return self.found(image)
 
     def _cropped(self, image: ImageId) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], dict[str, object]]:
         """Crops, and which of the image's usable detections they are or why there is none."""
         usable = self.of_image[image]
-        photo = self.run.dataset.image(*image)
+        photo = self.context.dataset.image(*image)
         crops, kept, failed = [], [], {}
         for position, (_, detection) in enumerate(usable):
             try:
                 mask = None if detection.rle is None else decode_rle(detection.rle)
-                crops.append(self.run.stages.crop(photo.rgb, mask, detection.bbox_xyxy, photo.K))
+                crops.append(self.context.stages.crop(photo.rgb, mask, detection.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose as failure:
                 failed[str(position)] = failure.reason
@@ -138,23 +143,27 @@ class QueryNodes:
     def found(self, image: ImageId) -> list[Found]:
         """The detections of an image that have a crop."""
         usable = self.of_image[image]
-        kept = self.run.store.read(self.crops(image)).document["kept"]
+        kept = self.context.store.read(self.crops(image)).document["kept"]
         return [Found(usable[position][0], row, usable[position][1]) for row, position in enumerate(kept)]
 
     def make_features(self, image: ImageId, found: Sequence[Found]) -> None:
         """Extract what is missing of the features of an image's detections."""
         if found:
-            refs = {layer: self.features(image, layer) for layer in self.run.stages.layers}
-            self.run.extract("query features", "", refs, len(found), lambda rows: self._crops_of(image, found, rows))
+            refs = {layer: self.features(image, layer) for layer in self.context.stages.layers}
+            self.context.extract(
+                "query features", "", refs, len(found), lambda rows: self._crops_of(image, found, rows)
+            )
 
     def _crops_of(self, image: ImageId, found: Sequence[Found], rows: Sequence[int]) -> Crops:
-        entry = self.run.store.read(self.crops(image))
+        entry = self.context.store.read(self.crops(image))
         geometry = None
-        if self.run.stages.extract.needs_geometry:
-            photo = self.run.dataset.image(*image)
+        if self.context.stages.extract.needs_geometry:
+            photo = self.context.dataset.image(*image)
             poses = [self.true_pose(found[row].detection) for row in rows]
             depth = [
-                render_depth(self.run.model(found[row].detection.obj_id).mesh, photo.K, T[None], photo.rgb.shape[:2])[0]
+                render_depth(
+                    self.context.model(found[row].detection.obj_id).mesh, photo.K, T[None], photo.rgb.shape[:2]
+                )[0]
                 for row, T in zip(rows, poses, strict=True)
             ]
             geometry = Geometry(depth, np.repeat(photo.K[None], len(rows), 0), np.stack(poses))
@@ -168,24 +177,24 @@ class QueryNodes:
                 found="detections without ground truth",
                 needed="detect=gt_mask or detect=gt_bbox",
             )
-        T = self.run.dataset.ground_truth(detection.scene_id, detection.im_id)[detection.gt_id].T_cam_obj
+        T = self.context.dataset.ground_truth(detection.scene_id, detection.im_id)[detection.gt_id].T_cam_obj
         return rigid(nearest_rotation(T[:3, :3]), T[:3, 3])  # published rotations are rounded, rays need exact ones
 
     def query(self, found: Found) -> tuple[Query, dict[str, float]]:
         """A detection as the online route reads it, and its share of its image's seconds."""
         image = (found.detection.scene_id, found.detection.im_id)
-        entries = {layer: self.run.store.read(self.features(image, layer)) for layer in self.run.stages.layers}
-        crops = self.run.store.read(self.crops(image))
-        maps = {layer: self.run.tensor(entry.array("maps", [found.row])[0]) for layer, entry in entries.items()}
+        entries = {layer: self.context.store.read(self.features(image, layer)) for layer in self.context.stages.layers}
+        crops = self.context.store.read(self.crops(image))
+        maps = {layer: self.context.tensor(entry.array("maps", [found.row])[0]) for layer, entry in entries.items()}
         mask, A_crop_img = crops.array("mask", [found.row])[0], crops.array("A_crop_img", [found.row])[0]
         share = {
             "crop": crops.time_s / crops.rows,
             "extract": max(entry.time_s for entry in entries.values()) / crops.rows,
         }
-        return Query(maps, self.run.tensor(mask), A_crop_img, self.run.K(image)), share
+        return Query(maps, self.context.tensor(mask), A_crop_img, self.context.K(image)), share
 
     def crop_failure(self, index: int, d: Detection) -> str:
         """Why a detection has no crop."""
         image = (d.scene_id, d.im_id)
         position = next(p for p, (i, _) in enumerate(self.of_image[image]) if i == index)
-        return str(self.run.store.read(self.crops(image)).document["failed"][str(position)])
+        return str(self.context.store.read(self.crops(image)).document["failed"][str(position)])

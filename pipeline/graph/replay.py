@@ -38,18 +38,18 @@ class Retracer:
         """How an answer came about; None where there is no crop to show."""
         if answer.detection_id is None:
             return None
-        run, image = self.queries.run, (answer.scene_id, answer.im_id)
+        context, image = self.queries.context, (answer.scene_id, answer.im_id)
         index, detection = self.queries.of_target[*image, answer.obj_id][answer.detection_id]
         found = next((f for f in self.queries.found(image) if f.index == index), None)
         if found is None:
             return None
-        query_rgb = run.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
+        query_rgb = context.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
         if answer.template_id is None:
             return Retraced(detection, query_rgb)
         score = answer.template_score if isinstance(answer, PoseEstimate) else 0.0
         bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
-        hypothesis = retrace_pose(run.stages, query, bank, answer.template_id, score)
+        hypothesis = retrace_pose(context.stages, query, bank, answer.template_id, score)
         if hypothesis.drawn is not None:
             return Retraced(detection, query_rgb, hypothesis.drawn.rgb, hypothesis)
-        crops = run.store.read(self.templates.crops(answer.obj_id))
+        crops = context.store.read(self.templates.crops(answer.obj_id))
         return Retraced(detection, query_rgb, crops.array("rgb", [answer.template_id])[0], hypothesis)

@@ -39,14 +39,14 @@ Instance = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """A run's answers held against the ground truth. ``of[i]``: errors of answer i against the instance it is of.
+class PoseEvaluation:
+    """A run's answers scored against the ground truth. ``by_answer[i]``: errors of answer i, None without an instance.
 
     ``correspondences``: median error of an instance's correspondences over its diameter, where they were asked for.
     """
 
     scored: ScoringResult
-    of: tuple[PoseErrors | None, ...]
+    by_answer: tuple[PoseErrors | None, ...]
     templates: Mapping[Instance, TemplateError]
     correspondences: Mapping[Instance, float]
 
@@ -58,7 +58,7 @@ class ScoreNodes:
     Without ``retrace`` they are not looked at.
     """
 
-    run: Context
+    context: Context
     templates: TemplateNodes
     poses: PoseNodes
     scorer: Scorer
@@ -67,11 +67,11 @@ class ScoreNodes:
     @cached_property
     def ref(self) -> Ref:
         """Scores of the run's poses."""
-        scorer, data = self.scorer, self.run.dataset
+        scorer, data = self.scorer, self.context.dataset
         recipe = {"kind": "scores", "version": SCORES_VERSION, "vsd_delta_mm": scorer.vsd_delta_mm}
         recipe |= {"correspondences": True} if self.retrace else {}
         depth = "" if scorer.no_vsd else files_digest({str(image): data.depth_path(*image) for image in scorer.images})
-        meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.run.object_ids}
+        meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.context.object_ids}
         info = data.model_path(0, folder=scorer.models).with_name("models_info.json")
         if info.exists():
             meshes["info"] = info
@@ -80,9 +80,9 @@ class ScoreNodes:
 
     def node(self) -> Node:
         """The entry as a plan shows it."""
-        state, targets = self.run.store.state(self.ref), len(self.run.targets)
+        state, targets = self.context.store.state(self.ref), len(self.context.targets)
         cost = "" if state == "cached" else f"{targets} targets to hold against ground truth"
-        size, seconds = self.run.store.size(self.ref), self.run.rates.seconds(self._work, targets)
+        size, seconds = self.context.store.size(self.ref), self.context.timings.seconds(self._work, targets)
         if size is not None:
             return Node("scores", f"{targets} targets", self.ref, state, size, cost)
         return Node("scores", f"{targets} targets", self.ref, state, 0, cost, seconds=seconds, sized=False)
@@ -91,19 +91,19 @@ class ScoreNodes:
     def _work(self) -> str:
         """What decides the seconds of a target."""
         how = [self.scorer.vsd_delta_mm, not self.scorer.no_vsd, self.retrace is not None, self.scorer.models]
-        return digest(["scores", self.run.dataset.name, how])
+        return digest(["scores", self.context.dataset.name, how])
 
-    def judge(self, answers: Sequence[Answer]) -> Judged:
+    def evaluate(self, answers: Sequence[Answer]) -> PoseEvaluation:
         """Scores of the run's answers, read or made."""
-        fresh = not self.run.store.is_complete(self.ref)
+        fresh = not self.context.store.is_complete(self.ref)
         if fresh:
             self._make(answers)
-        entry = self.run.store.read(self.ref)
+        entry = self.context.store.read(self.ref)
         seconds = entry.time_s if fresh else 0.0
-        self.run.progress.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
+        self.context.progress.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
         errors = tuple(errors_from_record(record) for record in entry.document["errors"])
         templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
-        return Judged(
+        return PoseEvaluation(
             ScoringResult(errors, scores_from_record(entry.document["scores"]), self.scorer.models),
             _by_answer(answers, errors),
             templates,
@@ -112,7 +112,7 @@ class ScoreNodes:
 
     def _make(self, answers: Sequence[Answer]) -> None:
         start = time.perf_counter()
-        with self.run.progress.bar(len(self.scorer.images), "scores", "image") as advance:
+        with self.context.progress.bar(len(self.scorer.images), "scores", "image") as advance:
             scored = self.scorer.score([row for _, row in _rows(answers)], progress=advance)
         of = _by_answer(answers, scored.errors)
         angles = {
@@ -127,8 +127,8 @@ class ScoreNodes:
         }
         if self.retrace:
             document["correspondences"] = self._correspondence_errors(answers, of)
-        self.run.store.put_document(self.ref, document, rows=len(answers), time_s=time.perf_counter() - start)
-        self.run.rates.note(self._work, len(self.run.targets), time.perf_counter() - start)
+        self.context.store.put_document(self.ref, document, rows=len(answers), time_s=time.perf_counter() - start)
+        self.context.timings.add(self._work, len(self.context.targets), time.perf_counter() - start)
 
     def _correspondence_errors(
         self, answers: Sequence[Answer], of: Sequence[PoseErrors | None]
@@ -136,7 +136,7 @@ class ScoreNodes:
         """Each instance with the median error of its answer's correspondences, over the diameter."""
         assert self.retrace is not None
         found: list[list[int | float]] = []
-        with self.run.progress.bar(len(answers), "correspondences", "answer") as advance:
+        with self.context.progress.bar(len(answers), "correspondences", "answer") as advance:
             for answer, errors in sorted(zip(answers, of, strict=True), key=lambda pair: pair[0].obj_id):
                 advance(1)
                 instance, traced = _instance(answer, errors), self.retrace(answer)
@@ -144,8 +144,8 @@ class ScoreNodes:
                 if instance is None or not best or best.points_obj is None or best.query_px_img is None:
                     continue
                 scene_id, im_id, obj_id, gt_id = instance
-                T_gt = self.run.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
-                model, K = self.scorer.shape(obj_id).model, self.run.K((scene_id, im_id))
+                T_gt = self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
+                model, K = self.scorer.shape(obj_id).model, self.context.K((scene_id, im_id))
                 off = correspondence_errors_mm(best.points_obj, best.query_px_img, K, T_gt, model.symmetries)
                 if len(off):
                     found.append([*instance, float(np.median(off)) / model.diameter_mm])
@@ -157,7 +157,7 @@ class ScoreNodes:
             return None
         scene_id, im_id, obj_id, gt_id = instance
         T_template = self.templates.read_views(obj_id, [answer.template_id]).T_cam_obj[0]
-        T_gt = self.run.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
+        T_gt = self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
         return template_error(T_template, T_gt, self.scorer.shape(obj_id).model.symmetries)
 
 

@@ -1,7 +1,8 @@
-"""What can be done in another process: one object, one image or one group of targets at a time.
+"""Tasks that can run in another process: one item (an object, an image, or a group of targets) at a time.
 
-A unit of work takes its inputs from the dataset and the store and leaves its results in the store, so that nothing but
-its name travels. Keys follow from specs and files alone: whoever does it, the same entries hold the same bytes.
+A task reads its inputs from the dataset and the store and writes its results to the store, so only the task's name
+and the item are sent to a worker. Keys follow from specs and files alone: whichever process runs an item, the entries
+hold the same bytes.
 """
 
 from __future__ import annotations
@@ -16,35 +17,41 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.progress import StepCount
 
-Unit = TypeVar("Unit", bound=Hashable)
+Item = TypeVar("Item", bound=Hashable)
 Advance = Callable[[int], None]
+"""Moves a progress bar by a number of steps."""
 Counts = Mapping[str, StepCount]
+"""Rows and seconds by step."""
 
 
 @dataclass(frozen=True)
-class Work(Generic[Unit]):
-    """One kind of work. ``do`` moves a bar by ``size`` of its unit in all; ``done``: all its entries are complete."""
+class Task(Generic[Item]):
+    """Something to compute for every item of a run.
+
+    ``do`` computes one item and advances its progress bar by ``size`` of the item in total; ``done`` says whether all
+    entries of an item are complete.
+    """
 
     name: str
-    do: Callable[[Unit, Advance], None]
-    done: Callable[[Unit], bool]
-    size: Callable[[Unit], int] = lambda unit: 1
+    do: Callable[[Item, Advance], None]
+    done: Callable[[Item], bool]
+    size: Callable[[Item], int] = lambda item: 1
 
 
 class Workers(Protocol):
-    """Other processes, on this machine or on others, that have the same graph, dataset and store."""
+    """Other processes, local or remote, that hold the same graph and share the dataset and the store."""
 
-    def each(self, work: str, units: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
-        """Units as they are finished, each with what was computed for it; lost workers are replaced.
+    def map(self, task: str, items: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
+        """Yield each item with its counts as soon as it is finished. Lost workers are replaced.
 
-        Raises DzopError with the words of the first unit that failed.
+        Raises DzopError with the message of the first item that failed.
         """
         ...
 
 
 def use_threads(threads: int) -> None:
-    """CPU threads of this process from now on, in whatever library; 0 leaves them as they are."""
+    """Set the number of CPU threads of this process for torch, OpenCV and BLAS; 0 leaves the defaults."""
     if threads:
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
-        threadpool_limits(threads)  # BLAS beneath SciPy, which has threads of its own
+        threadpool_limits(threads)  # the BLAS of SciPy and NumPy has a thread pool of its own

@@ -16,9 +16,9 @@ from pipeline.fits import Fit, Fitted, chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
 from pipeline.functional.resample import resample
 from pipeline.functional.rigid import rigid
-from pipeline.graph.context import Context, stacked
-from pipeline.graph.tasks import Advance, Work
-from pipeline.graph.timings import work_of
+from pipeline.graph.context import Context, stack_crops
+from pipeline.graph.tasks import Advance, Task
+from pipeline.graph.timings import timing_key
 from pipeline.items.features import TemplateCells
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.route import TemplateView
@@ -67,7 +67,7 @@ class TemplateNodes:
     ``views``: whole templates of an object that a bank keeps for the next query.
     """
 
-    run: Context
+    context: Context
     views: int = 64
 
     @cached_property
@@ -76,31 +76,31 @@ class TemplateNodes:
         return lru_cache(maxsize=None)(self._templates)
 
     def _templates(self, obj_id: int) -> Ref:
-        recipe = {"kind": "templates", "render": self.run.stages.render.recipe()}
-        return make_ref("templates", recipe, {"mesh": self.run.mesh_digest(obj_id)})
+        recipe = {"kind": "templates", "render": self.context.stages.render.recipe()}
+        return make_ref("templates", recipe, {"mesh": self.context.mesh_digest(obj_id)})
 
     def crops(self, obj_id: int) -> Ref:
         """Their crops."""
-        recipe = {"kind": "template crops", "crop": self.run.stages.crop.recipe()}
+        recipe = {"kind": "template crops", "crop": self.context.stages.crop.recipe()}
         return make_ref("crops", recipe, {"templates": self.templates(obj_id).key})
 
     def features(self, obj_id: int, layer: int) -> Ref:
         """Their features of one layer."""
-        return self.run.features(layer, {"crops": self.crops(obj_id).key})
+        return self.context.features(layer, {"crops": self.crops(obj_id).key})
 
     def make_templates(self, obj_id: int) -> int:
         """Render what is missing of an object's templates; returns how many there are."""
         ref = self.templates(obj_id)
-        if self.run.store.is_complete(ref):
-            rows = self.run.store.read(ref).rows
-            self.run.progress.add("templates", reused=rows)
+        if self.context.store.is_complete(ref):
+            rows = self.context.store.read(ref).rows
+            self.context.progress.add("templates", reused=rows)
             return rows
-        K, T_cam_obj, (height, width) = self.run.stages.render.cameras(self.run.model(obj_id).mesh)
+        K, T_cam_obj, (height, width) = self.context.stages.render.cameras(self.context.model(obj_id).mesh)
         count = len(T_cam_obj)
 
         def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
-            rgb, depth_mm = self.run.stages.render.render(
-                self.run.model(obj_id).mesh, K, T_cam_obj[rows], (height, width)
+            rgb, depth_mm = self.context.stages.render.render(
+                self.context.model(obj_id).mesh, K, T_cam_obj[rows], (height, width)
             )
             empty = np.flatnonzero(~(depth_mm > 0).any((1, 2)))
             if len(empty):
@@ -112,15 +112,15 @@ class TemplateNodes:
             "depth_mm": Layout((height, width), "float32", compress=True),
             "T_cam_obj": Layout((4, 4), "float64"),
         }
-        self.run.fill(
+        self.context.fill(
             "templates", f"render object {obj_id}", {ref: layout}, count, VIEWS_PER_BATCH, compute, {"K": K.tolist()},
-            work=work_of("templates", self.run.stages),
+            timing=timing_key("templates", self.context.stages),
         )  # fmt: skip
         return count
 
     def read_views(self, obj_id: int, rows: Sequence[int] | None = None) -> Templates:
         """An object's templates, or some of them."""
-        entry = self.run.store.read(self.templates(obj_id))
+        entry = self.context.store.read(self.templates(obj_id))
         depth_mm = entry.array("depth_mm", rows)
         K = np.array(entry.document["K"])
         return Templates(entry.array("rgb", rows), depth_mm, depth_mm > 0, K, entry.array("T_cam_obj", rows))
@@ -133,26 +133,26 @@ class TemplateNodes:
             views = self.read_views(obj_id, rows)
             h, w = views.mask.shape[1:]
             whole = (-0.5, -0.5, w - 0.5, h - 0.5)
-            crop = self.run.stages.crop
+            crop = self.context.stages.crop
             crops = [crop(rgb, mask, whole, views.K) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
-            return {ref.key: stacked(crops)}
+            return {ref.key: stack_crops(crops)}
 
-        self.run.fill(
-            "template crops", f"crop object {obj_id}", {ref: self.run.crops_layout()}, count, CROPS_PER_BATCH, compute,
-            work=work_of("template crops", self.run.stages),
+        self.context.fill(
+            "template crops", f"crop object {obj_id}", {ref: self.context.crops_layout()}, count, CROPS_PER_BATCH,
+            compute, timing=timing_key("template crops", self.context.stages),
         )  # fmt: skip
 
     def make_features(self, obj_id: int, count: int, layers: Sequence[int]) -> None:
         """Extract what is missing of an object's template features."""
         refs = {layer: self.features(obj_id, layer) for layer in layers}
-        self.run.extract(
+        self.context.extract(
             "template features", f"features of object {obj_id}", refs, count, lambda rows: self._crops_of(obj_id, rows)
         )
 
     def _crops_of(self, obj_id: int, rows: Sequence[int]) -> Crops:
-        entry = self.run.store.read(self.crops(obj_id))
+        entry = self.context.store.read(self.crops(obj_id))
         geometry = None
-        if self.run.stages.extract.needs_geometry:
+        if self.context.stages.extract.needs_geometry:
             views = self.read_views(obj_id, rows)
             geometry = Geometry(list(views.depth_mm), np.repeat(views.K[None], len(rows), 0), views.T_cam_obj)
         return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
@@ -167,18 +167,20 @@ class TemplateNodes:
     def make_fitted(self, obj_id: int) -> None:
         """Fit what is missing to an object's templates; what a fit stands on comes before it."""
         cells, began = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer)), time.perf_counter()
-        missing = [fit for fit in self.run.stages.fits if not self.run.store.is_complete(self.fitted(obj_id, fit))]
-        for fit in self.run.stages.fits:
+        missing = [
+            fit for fit in self.context.stages.fits if not self.context.store.is_complete(self.fitted(obj_id, fit))
+        ]
+        for fit in self.context.stages.fits:
             ref, start = self.fitted(obj_id, fit), time.perf_counter()
-            if self.run.store.is_complete(ref):
-                self.run.progress.add("fits", reused=1)
+            if self.context.store.is_complete(ref):
+                self.context.progress.add("fits", reused=1)
                 continue
             base = {} if fit.base is None else self.read_fitted(obj_id, fit.base, device="cpu")
             arrays = {name: array.numpy() for name, array in fit(cells(fit.layer), base).items()}
-            self.run.progress.add("fits", time_s=time.perf_counter() - start)
+            self.context.progress.add("fits", time_s=time.perf_counter() - start)
             self._keep(ref, arrays)
-        if missing and len(missing) == len(self.run.stages.fits):
-            self.run.rates.note(work_of("fits", self.run.stages), 1, time.perf_counter() - began)
+        if missing and len(missing) == len(self.context.stages.fits):
+            self.context.timings.add(timing_key("fits", self.context.stages), 1, time.perf_counter() - began)
 
     def _keep(self, ref: Ref, arrays: dict[str, np.ndarray]) -> None:
         """Store arrays of any shapes as an entry of one row."""
@@ -187,19 +189,19 @@ class TemplateNodes:
             return {ref.key: {name: array[None] for name, array in arrays.items()}}
 
         layouts = {name: Layout(array.shape, array.dtype.name) for name, array in arrays.items()}
-        self.run.fill("fits", "", {ref: layouts}, 1, 1, compute)
+        self.context.fill("fits", "", {ref: layouts}, 1, 1, compute)
 
     def read_fitted(self, obj_id: int, fit: Fit, *, device: str) -> Fitted:
         """Arrays of a fit and of all it stands on."""
         arrays: dict[str, torch.Tensor] = {}
         for part in chain(fit):
-            entry = self.run.store.read(self.fitted(obj_id, part))
+            entry = self.context.store.read(self.fitted(obj_id, part))
             arrays |= {name: torch.from_numpy(entry.array(name)[0]).to(device) for name in entry.arrays}
         return arrays
 
     def _cells(self, obj_id: int, layer: int) -> TemplateCells:
         """Foreground of an object's templates, float16; whole maps are read a few at a time."""
-        maps, crops = self.run.store.read(self.features(obj_id, layer)), self.run.store.read(self.crops(obj_id))
+        maps, crops = self.context.store.read(self.features(obj_id, layer)), self.context.store.read(self.crops(obj_id))
         features, template = [], []
         for first in range(0, crops.rows, CROPS_PER_BATCH):
             rows = range(first, min(first + CROPS_PER_BATCH, crops.rows))
@@ -209,28 +211,30 @@ class TemplateNodes:
         return TemplateCells(torch.cat(features), torch.cat(template), crops.rows)
 
     @cached_property
-    def onboarding(self) -> Work[int]:
+    def onboarding(self) -> Task[int]:
         """Everything offline, by object."""
-        return Work("onboarding", self._onboard, self._onboarded)
+        return Task("onboarding", self._onboard, self._onboarded)
 
     def _onboarded(self, obj_id: int) -> bool:
         refs = [self.templates(obj_id), self.crops(obj_id)]
-        refs += [self.features(obj_id, layer) for layer in self.run.stages.layers]
-        refs += [self.fitted(obj_id, fit) for fit in self.run.stages.fits]
-        return all(map(self.run.store.is_complete, refs))
+        refs += [self.features(obj_id, layer) for layer in self.context.stages.layers]
+        refs += [self.fitted(obj_id, fit) for fit in self.context.stages.fits]
+        return all(map(self.context.store.is_complete, refs))
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
-        self.run.model.forget(obj_id)  # and with the mesh what the renderer made of it, three times as large
+        self.context.models.discard(obj_id)  # and with the mesh what the renderer made of it, three times as large
         self.make_crops(obj_id, count)
-        self.make_features(obj_id, count, self.run.stages.layers)
+        self.make_features(obj_id, count, self.context.stages.layers)
         self.make_fitted(obj_id)
         advance(1)
 
     def feature_bytes(self) -> int:
         """What the stored features of all objects take."""
-        refs = [self.features(obj_id, layer) for obj_id in self.run.object_ids for layer in self.run.stages.layers]
-        return sum(self.run.store.size(ref) or 0 for ref in refs)
+        refs = [
+            self.features(obj_id, layer) for obj_id in self.context.object_ids for layer in self.context.stages.layers
+        ]
+        return sum(self.context.store.size(ref) or 0 for ref in refs)
 
     @cached_property
     def bank(self) -> Callable[[int], StoredBank]:
@@ -238,16 +242,18 @@ class TemplateNodes:
         return lru_cache(maxsize=1)(self._bank)
 
     def _bank(self, obj_id: int) -> StoredBank:
-        layers = self.run.stages.layers
-        features = {layer: self.run.store.read(self.features(obj_id, layer)) for layer in layers}
-        crops, templates = self.run.store.read(self.crops(obj_id)), self.run.store.read(self.templates(obj_id))
+        layers = self.context.stages.layers
+        features = {layer: self.context.store.read(self.features(obj_id, layer)) for layer in layers}
+        crops, templates = self.context.store.read(self.crops(obj_id)), self.context.store.read(self.templates(obj_id))
         K = np.array(templates.document["K"])
 
         @lru_cache(maxsize=self.views)
         def view(index: int) -> TemplateView:
             return TemplateView(
-                features={layer: self.run.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()},
-                mask=self.run.tensor(crops.array("mask", [index])[0]),
+                features={
+                    layer: self.context.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()
+                },
+                mask=self.context.tensor(crops.array("mask", [index])[0]),
                 A_crop_img=crops.array("A_crop_img", [index])[0],
                 depth_mm=templates.array("depth_mm", [index])[0],
                 K=K,
@@ -256,11 +262,11 @@ class TemplateNodes:
 
         @lru_cache(maxsize=4)
         def fitted(fit: Fit) -> Fitted:
-            return self.read_fitted(obj_id, fit, device=self.run.device)
+            return self.read_fitted(obj_id, fit, device=self.context.device)
 
         return StoredBank(
-            maps=lambda: self.run.tensor(features[self.run.stages.match.layer].array("maps")),
-            masks=lambda: self.run.tensor(crops.array("mask")),
+            maps=lambda: self.context.tensor(features[self.context.stages.match.layer].array("maps")),
+            masks=lambda: self.context.tensor(crops.array("mask")),
             view=view,
             draw=partial(self._drawn, obj_id),
             poses=lambda: templates.array("T_cam_obj"),
@@ -269,16 +275,20 @@ class TemplateNodes:
 
     def _drawn(self, obj_id: int, T_cam_obj: Pose, A_crop_img: Matrix, K: Matrix) -> TemplateView:
         """The object in a pose as a query's crop shows it: drawn twice as large, shrunk as templates are."""
-        stages, size = self.run.stages, self.run.stages.crop.size
+        stages, size = self.context.stages, self.context.stages.crop.size
         K_crop, R_crop_cam = crop_camera(A_crop_img, K)
         A_drawn_crop = resize_affine(float(DRAWN_LARGER))
         K_drawn, T_drawn_obj = A_drawn_crop @ K_crop, rigid(R_crop_cam, np.zeros(3)) @ T_cam_obj
         size_hw = (DRAWN_LARGER * size,) * 2
-        rgb, depth_mm = stages.render.render(self.run.model(obj_id).mesh, K_drawn, T_drawn_obj[None], size_hw)
+        rgb, depth_mm = stages.render.render(self.context.model(obj_id).mesh, K_drawn, T_drawn_obj[None], size_hw)
         A_crop_drawn = np.linalg.inv(A_drawn_crop)
         crop = np.rint(resample(rgb[0], A_crop_drawn, size=size)).clip(0, 255).astype(np.uint8)
         mask = resample(depth_mm[0] > 0, A_crop_drawn, size=size) >= HALF
         geometry = Geometry([depth_mm[0]], K_drawn[None], T_drawn_obj[None])
         crops = Crops(crop[None], mask[None], A_crop_drawn[None], geometry)
-        features = {layer: self.run.tensor(maps[0]) for layer, maps in self.run.maps(crops, stages.layers).items()}
-        return TemplateView(features, self.run.tensor(mask), A_crop_drawn, depth_mm[0], K_drawn, T_drawn_obj, rgb=crop)
+        features = {
+            layer: self.context.tensor(maps[0]) for layer, maps in self.context.maps(crops, stages.layers).items()
+        }
+        return TemplateView(
+            features, self.context.tensor(mask), A_crop_drawn, depth_mm[0], K_drawn, T_drawn_obj, rgb=crop
+        )

@@ -1,7 +1,8 @@
-"""Seconds per row as earlier runs on this machine took them, beside the store: what a plan foretells time by.
+"""Seconds per row measured by earlier runs on this machine, from which a plan estimates its time.
 
-Kept by machine, device and number of threads, and by all that decides the work of a row, so that nothing is foretold
-of what was not measured. A place that cannot be written to, or none, costs a plan its times and nothing else.
+The file lies beside the store, one for every machine, device and number of threads. Timings are looked up by a digest
+of everything that decides the cost of a row (``timing_key``), so a plan never extrapolates to work that was not
+measured. If the file cannot be read or written, plans lack their times; nothing else changes.
 """
 
 from __future__ import annotations
@@ -23,58 +24,58 @@ FOLDER = ".rates"
 
 
 @dataclass(eq=False)
-class Rates:
-    """Rows and seconds by digest of the work. ``folder`` None: nothing is kept; ``device``: where tensors live."""
+class Timings:
+    """Total rows and seconds by timing key. ``folder`` None disables saving; ``device`` is the torch device."""
 
     folder: Path | None
     device: str
-    noted: dict[str, list[float]] = field(default_factory=dict)
+    measured: dict[str, list[float]] = field(default_factory=dict)
 
-    def note(self, work: str, rows: int, seconds: float) -> None:
-        """Count rows that were computed."""
+    def add(self, key: str, rows: int, seconds: float) -> None:
+        """Add rows that this run computed."""
         if rows and seconds > 0:
-            before = self.noted.get(work, [0.0, 0.0])
-            self.noted[work] = [before[0] + rows, before[1] + seconds]
+            before = self.measured.get(key, [0.0, 0.0])
+            self.measured[key] = [before[0] + rows, before[1] + seconds]
 
-    def seconds(self, work: str, rows: float) -> float | None:
-        """What rows of a work will take; None where nobody measured it here."""
-        known = self._kept.get(work)
-        return None if known is None else rows * known[1] / known[0]
+    def seconds(self, key: str, rows: float) -> float | None:
+        """Estimated seconds for a number of rows; None if this work was never measured here."""
+        totals = self._saved.get(key)
+        return None if totals is None else rows * totals[1] / totals[0]
 
     def save(self) -> None:
-        """Keep what this run measured: of a work its latest run's figures, which know the machine as it is now."""
-        if self.folder is None or not self.noted:
+        """Write this run's measurements. They replace older ones of the same key: the machine may have changed."""
+        if self.folder is None or not self.measured:
             return
         try:
-            write_json(self._path, self._read() | self.noted)
+            write_json(self._path, self._read() | self.measured)
         except OSError:
             return
 
     @property
     def _path(self) -> Path:
         assert self.folder is not None
-        cuda = torch.cuda.get_device_name(self.device) if self.device.startswith("cuda") else "cpu"
-        machine = [platform.node(), platform.machine(), cuda, torch.get_num_threads()]
+        processor = torch.cuda.get_device_name(self.device) if self.device.startswith("cuda") else "cpu"
+        machine = [platform.node(), platform.machine(), processor, torch.get_num_threads()]
         return self.folder / FOLDER / f"{digest(machine)[:16]}.json"
 
     @cached_property
-    def _kept(self) -> dict[str, list[float]]:
+    def _saved(self) -> dict[str, list[float]]:
         return self._read()
 
     def _read(self) -> dict[str, list[float]]:
         if self.folder is None:
             return {}
         try:
-            kept = json.loads(self._path.read_text())
-            return {str(work): [float(rows), float(seconds)] for work, (rows, seconds) in kept.items() if rows > 0}
+            saved = json.loads(self._path.read_text())
+            return {str(key): [float(rows), float(seconds)] for key, (rows, seconds) in saved.items() if rows > 0}
         except (OSError, ValueError, TypeError, AttributeError):
             return {}
 
 
-def work_of(step: str, stages: Stages, layers: Sequence[int] = (), rows: int = 0) -> str:
-    """Digest of what decides the seconds of a step's row. ``rows``: templates that a pose is searched among."""
+def timing_key(step: str, stages: Stages, layers: Sequence[int] = (), rows: int = 0) -> str:
+    """Digest of everything that decides the seconds of a row. ``rows``: how many templates a query is matched with."""
     if step == "features":
-        # a pass ends at the deepest layer; pseudo-layers, which are negative, want all of it
+        # A pass ends at the deepest layer. Pseudo-layers are negative and need the full pass.
         deepest = min(layers) if min(layers) < 0 else max(layers)
         return digest([step, stages.extract.recipe(), deepest])
     if step == "fits":
