@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from benchmarks.measure import Figure, interleaved
-from pipeline.backbones.determinism import exact_convolutions
+from pipeline.backbones.determinism import use_deterministic_convolutions
 from pipeline.backbones.stable_diffusion.features import DiffusionBackbone, DiffusionFeatures
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
@@ -70,9 +70,9 @@ def _bare(backbone: DiffusionBackbone, images: int) -> None:
     stop = deepest.register_forward_pre_hook(_reached)
     try:
         for _ in range(0, images, step):
-            with exact_convolutions():
+            with use_deterministic_convolutions():
                 latent = vae.encode(torch.zeros(step, 3, spec.input_size, spec.input_size, **like)).latent_dist.mean
-            with exact_convolutions(), contextlib.suppress(_Reached):
+            with use_deterministic_convolutions(), contextlib.suppress(_Reached):
                 unet(latent, torch.tensor(spec.timestep), model.prompt.expand(step, -1, -1))
     finally:
         stop.remove()

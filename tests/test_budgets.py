@@ -14,7 +14,7 @@ import torch
 from command import Ran, run_dzop
 from huggingface_hub.errors import LocalEntryNotFoundError
 
-from pipeline.backbones.batching import Footprint, fitting_batch
+from pipeline.backbones.batching import Footprint, compute_batch_size
 from pipeline.errors import BadInput
 from pipeline.graph import Graph, Memory
 from pipeline.graph.lru import LRUCache
@@ -122,14 +122,17 @@ def test_a_run_that_cannot_fit_says_so_before_anything_is_spent(dzop):
 
 
 def test_a_batch_is_sized_to_the_budget():
-    cpu, footprint = torch.device("cpu"), Footprint(weights=0, a_pass=5 << 20, a_crop=10 << 20, most=16)
+    cpu, footprint = (
+        torch.device("cpu"),
+        Footprint(weight_bytes=0, bytes_per_pass=5 << 20, bytes_per_crop=10 << 20, max_batch=16),
+    )
     taken = psutil.Process().memory_info().rss
     sizes = []
     for room in (0, 60 << 20, 1 << 40):
         budget = int((taken + room) / 0.9)  # a tenth stays free
-        sizes.append(fitting_batch(footprint, Runtime(max_memory=f"{budget // 1000}kB"), cpu))
+        sizes.append(compute_batch_size(footprint, Runtime(max_memory=f"{budget // 1000}kB"), cpu))
     assert sizes[0] == 1 < sizes[1] <= 6 < sizes[2] <= 16
-    assert fitting_batch(footprint, Runtime(), cpu, ahead=1 << 50) == 1
+    assert compute_batch_size(footprint, Runtime(), cpu, ahead=1 << 50) == 1
 
 
 PEAK = """

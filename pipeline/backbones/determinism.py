@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 import torch
 
 
-def exact_convolutions() -> AbstractContextManager[None]:
+def use_deterministic_convolutions() -> AbstractContextManager[None]:
     """Within it cuDNN picks deterministic algorithms, and float32 products of float32 values."""
     flags: AbstractContextManager[None] = torch.backends.cudnn.flags(
         enabled=True, benchmark=False, deterministic=True, allow_tf32=False

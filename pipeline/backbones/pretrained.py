@@ -31,11 +31,11 @@ def load_pretrained(class_name: str, root: Path, tensors: Sequence[Path], **opti
     fixed = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
     fixed["ignore_mismatched_sizes"] = True  # told below, by name
     try:
-        with quiet_libraries():
+        with silence_libraries():
             model, told = cls.from_pretrained(str(root), **fixed, **options)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError, SafetensorError) as error:
         raise BadInput(
-            tensors[0], found=whole_text(error), needed=f"weights of a {class_name} for config.json"
+            tensors[0], found=full_text(error), needed=f"weights of a {class_name} for config.json"
         ) from None
     if told["mismatched_keys"]:
         name, stored, needed = min(told["mismatched_keys"])
@@ -46,13 +46,13 @@ def load_pretrained(class_name: str, root: Path, tensors: Sequence[Path], **opti
     return model
 
 
-def whole_text(error: Exception) -> str:
+def full_text(error: Exception) -> str:
     """All of an error's text on one line; the first line alone often names no value."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 @contextmanager
-def quiet_libraries() -> Iterator[None]:
+def silence_libraries() -> Iterator[None]:
     """Without the progress bars and remarks of diffusers and transformers while they read weights."""
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging

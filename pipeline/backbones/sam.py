@@ -39,7 +39,7 @@ class SamWeights:
         return load_pretrained(self.class_name, self.root, self.tensors).float()
 
 
-def find(weights: str, revision: str | None) -> SamWeights:
+def open_sam_weights(weights: str, revision: str | None) -> SamWeights:
     """What lies in a folder or at a hub id. Raises BadInput for what is no SAM or no safetensors."""
     path = Path(weights).expanduser()
     if not is_local(weights):

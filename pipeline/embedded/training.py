@@ -19,9 +19,9 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torch.utils.data import DataLoader, Dataset
 
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
-from pipeline.backbones.stable_diffusion.decoder import decoder_maps, map_shape
-from pipeline.backbones.stable_diffusion.features import clean_latent, network_image
-from pipeline.backbones.stable_diffusion.loading import untrained
+from pipeline.backbones.stable_diffusion.decoder import map_shape, read_decoder_maps
+from pipeline.backbones.stable_diffusion.features import encode_latent, to_network_image
+from pipeline.backbones.stable_diffusion.loading import build_untrained
 from pipeline.embedded import losses
 from pipeline.embedded.batches import CELLS, PairBatch, Source, pair_batch, picture_batch
 from pipeline.functional.aggregation import Aggregation
@@ -138,7 +138,7 @@ class Autoencoder(Stage):
 
     def build(self, place: Place) -> Any:
         """From nothing."""
-        return untrained(UNET, VAE)[1]
+        return build_untrained(UNET, VAE)[1]
 
     def batch(self, step: int) -> Tensor:
         """Pictures."""
@@ -146,7 +146,7 @@ class Autoencoder(Stage):
 
     def loss(self, batch: Tensor, step: int) -> dict[str, Tensor]:
         """Reconstruction."""
-        image = network_image(batch.to(self.device), size=128)
+        image = to_network_image(batch.to(self.device), size=128)
         with _mixed(self.device):
             posterior = self.model.encode(image).latent_dist
             generator = torch.Generator().manual_seed(step)
@@ -165,7 +165,7 @@ class Denoiser(Stage):
         """From nothing, on the latents of the autoencoder."""
         self.encode = Latents(place, self.device)
         self.alphas = torch.from_numpy(alphas_cumprod({})).float().to(self.device)
-        return untrained(UNET, VAE)[0]
+        return build_untrained(UNET, VAE)[0]
 
     def batch(self, step: int) -> Tensor:
         """Pictures."""
@@ -192,7 +192,7 @@ class Descriptors(Stage):
     def build(self, place: Place) -> Any:
         """On from the denoiser's average."""
         self.encode = Latents(place, self.device)
-        unet = untrained(UNET, VAE)[0]
+        unet = build_untrained(UNET, VAE)[0]
         unet.load_state_dict(_loaded(place.checkpoint("denoiser"), self.device)["average"])
         return Described(unet)
 
@@ -219,7 +219,7 @@ class Described(nn.Module):
         """Descriptors, and the maps that templates are chosen by."""
         with _mixed(latent.device):
             known = prompt(1, latent.device)
-            maps = decoder_maps(self.unet, latent, TIMESTEP, known, layers=LAYERS, hook="pre")
+            maps = read_decoder_maps(self.unet, latent, TIMESTEP, known, layers=LAYERS, hook="pre")
             maps = {k: m.float() for k, m in maps.items()}
             return self.head(maps), maps[MATCH_LAYER]
 
@@ -242,7 +242,7 @@ class Latents:
 
     def __init__(self, place: Place, device: torch.device) -> None:
         saved = _loaded(place.checkpoint("autoencoder"), device)
-        self.vae = untrained(UNET, VAE)[1].to(device, memory_format=torch.channels_last)
+        self.vae = build_untrained(UNET, VAE)[1].to(device, memory_format=torch.channels_last)
         self.vae.load_state_dict(saved["average"])
         self.vae.eval().requires_grad_(False)
         self.config = VAE | {"scaling_factor": saved["scaling_factor"]}
@@ -251,7 +251,7 @@ class Latents:
     def __call__(self, rgb: Tensor) -> Tensor:
         """Clean latents."""
         with _mixed(rgb.device):
-            latent = clean_latent(self.vae, self.config, network_image(rgb, size=128))
+            latent = encode_latent(self.vae, self.config, to_network_image(rgb, size=128))
         return latent.float().contiguous(memory_format=torch.channels_last)
 
 
@@ -354,7 +354,7 @@ def _save(stage: Stage, optimiser: torch.optim.Optimizer, step: int, place: Plac
 @torch.no_grad()
 def _scaling(stage: Autoencoder) -> float:
     """One over the standard deviation of latents (Rombach et al., CVPR 2022, App. G)."""
-    image = network_image(picture_batch(stage.source, 0, count=32).to(stage.device), size=128)
+    image = to_network_image(picture_batch(stage.source, 0, count=32).to(stage.device), size=128)
     return round(1 / float(stage.average.encode(image).latent_dist.mean.std()), 4)
 
 

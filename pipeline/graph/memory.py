@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import psutil
 import torch
 
-from pipeline.backbones.batching import SHARE, Footprint, Sized, fitting_batch
+from pipeline.backbones.batching import BUDGET_SHARE, Footprint, Sized, compute_batch_size
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
@@ -68,11 +68,11 @@ class Memory:
 
     def check(self, limit: int | None, field: str, found: object) -> None:
         """Raise BadInput where the peak is above a limit, with what would help."""
-        if limit is None or self.peak <= SHARE * limit:
+        if limit is None or self.peak <= BUDGET_SHARE * limit:
             return
         most = max(self.parts, key=lambda name: self.parts[name])
         helps = dict.fromkeys(_HELP[name.split(" of ")[0]] for name in (self.largest, most) if name)
-        spare = f"{format_bytes(self.peak / SHARE)}: a tenth to spare beside {self.text()}"
+        spare = f"{format_bytes(self.peak / BUDGET_SHARE)}: a tenth to spare beside {self.text()}"
         raise BadInput(field, found=found, needed=f"{spare}; what would help: {'; '.join(helps)}")
 
 
@@ -137,11 +137,11 @@ def _extracting(context: Context, described: ProposalNodes | None) -> tuple[Foot
             found.append(extract.footprint(layers, context.stages.crop.size, device))
         else:
             unknown.append(extract.kind)
-    weights = sum(footprint.weights for footprint in found)
+    weights = sum(footprint.weight_bytes for footprint in found)
     if described is not None:
         weights += getattr(described.detector.proposals, "weight_bytes", int)()
         unknown.append("passes of the proposer")
-    return max(found, key=lambda f: f.a_pass + f.a_crop, default=None), weights, tuple(unknown)
+    return max(found, key=lambda f: f.bytes_per_pass + f.bytes_per_crop, default=None), weights, tuple(unknown)
 
 
 def memory_of(context: Context, need: Need, *, least: bool = False) -> tuple[Memory, Memory | None]:
@@ -151,13 +151,14 @@ def memory_of(context: Context, need: Need, *, least: bool = False) -> tuple[Mem
     batch, a_batch = context.runtime.batch or 1, 0
     if need.footprint is not None:
         if not least:
-            batch = context.runtime.batch or fitting_batch(need.footprint, context.runtime, device, ahead=need.weights)
+            fitting = compute_batch_size(need.footprint, context.runtime, device, ahead=need.weights)
+            batch = context.runtime.batch or fitting
         batch = min(batch, need.rows)
-        a_batch = need.footprint.a_pass + batch * need.footprint.a_crop
+        a_batch = need.footprint.bytes_per_pass + batch * need.footprint.bytes_per_crop
     views = 1 if least else views_kept(context, need)
     bank = need.bank + need.online + views * need.view
     if need.look and need.footprint is not None:  # a pass while the templates are there
-        bank += need.look + need.footprint.a_pass + need.footprint.a_crop
+        bank += need.look + need.footprint.bytes_per_pass + need.footprint.bytes_per_crop
     working = {f"{_BATCH} of {batch}": a_batch, _BANK: bank} if a_batch else {_BANK: bank}
     drawing, unknown = {"rendering": need.render, _FITS: need.fits}, ", ".join(need.unknown)
     if device.type == "cpu":
@@ -174,7 +175,7 @@ def views_kept(context: Context, need: Need) -> int:
     if limit is None:
         return VIEWS_MOST
     taken = need.weights + need.bank + need.online + (psutil.Process().memory_info().rss if on_cpu else 0)
-    room = min(VIEWS_BYTES, int(SHARE * limit) - taken)
+    room = min(VIEWS_BYTES, int(BUDGET_SHARE * limit) - taken)
     return max(1, min(VIEWS_MOST, room // max(1, need.view)))
 
 

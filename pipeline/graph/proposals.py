@@ -22,7 +22,7 @@ from pipeline.items.records import proposal_from_record, proposal_to_record
 from pipeline.items.views import Crops, Proposal
 from pipeline.spec import digest
 from pipeline.stages.detect import DescribingDetector
-from pipeline.stages.detect.proposals import Proposing
+from pipeline.stages.detect.proposals import LoadedProposer
 from pipeline.stages.extract import Extractor
 from pipeline.store import Ref, make_ref
 
@@ -44,7 +44,7 @@ class ProposalNodes:
         return TemplateNodes(self.context)
 
     @cached_property
-    def proposing(self) -> Proposing:
+    def proposing(self) -> LoadedProposer:
         """The proposer with its weights, loaded when the first image lacks its proposals."""
         return self.detector.proposals.load(self.context.runtime)
 

@@ -51,8 +51,8 @@ def test_edges_are_the_same_in_any_batch_and_stay_while_the_weights_change():
 
 def test_edges_count_in_the_footprint():
     with_edges, without = (Embedded().footprint(layers, 128) for layers in (ALL, LAYERS))
-    assert with_edges.a_crop - without.a_crop == maps_bytes([(8, 64, 64)])
-    assert with_edges.weights == without.weights
+    assert with_edges.bytes_per_crop - without.bytes_per_crop == maps_bytes([(8, 64, 64)])
+    assert with_edges.weight_bytes == without.weight_bytes
 
 
 def test_the_two_sets_of_weights_have_keys_of_their_own():
@@ -73,11 +73,9 @@ def test_a_template_takes_milliseconds_in_batches():
 
 
 def test_missing_weights_say_how_to_make_them(tmp_path, monkeypatch):
-    embedded.shipped_config.cache_clear()
     monkeypatch.setattr(embedded, "FOLDER", tmp_path)
     with pytest.raises(BadInput, match="make train-embedded"):
         Embedded().feature_shape(2)
-    embedded.shipped_config.cache_clear()
 
 
 def test_the_head_fuses_both_sides_alike_at_twice_the_finest_layers_cells():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.backbones.stable_diffusion.features import network_image
-from pipeline.backbones.stable_diffusion.noise import draw, noised
+from pipeline.backbones.stable_diffusion.features import to_network_image
+from pipeline.backbones.stable_diffusion.noise import add_noise, draw_noise
 from pipeline.errors import BadInput
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
@@ -75,10 +75,10 @@ def test_widths_that_cannot_be_built_are_refused() -> None:
 
 def test_noising_keeps_unit_variance_and_ends_are_exact() -> None:
     latent, noise = torch.randn(2, 4, 64, 64), torch.randn(2, 4, 64, 64)
-    assert torch.equal(noised(latent, noise, alpha_cumprod=1.0), latent)
-    assert torch.equal(noised(latent, noise, alpha_cumprod=0.0), noise)
+    assert torch.equal(add_noise(latent, noise, alpha_cumprod=1.0), latent)
+    assert torch.equal(add_noise(latent, noise, alpha_cumprod=0.0), noise)
     # 32768 draws: the variance is known to 1/sqrt(16384) = 0.8 %
-    assert abs(float(noised(latent, noise, alpha_cumprod=0.3).var()) - 1) < 0.04
+    assert abs(float(add_noise(latent, noise, alpha_cumprod=0.3).var()) - 1) < 0.04
 
 
 def test_noise_follows_seed_and_content() -> None:
@@ -87,7 +87,7 @@ def test_noise_follows_seed_and_content() -> None:
 
     def noise(mode: str, seed: int = 0, rows: list[int] | None = None) -> torch.Tensor:
         rows = rows or [0, 1, 2]
-        return draw(mode, rgb[rows], mask[rows], seed=seed, shape=(4, 8, 8))
+        return draw_noise(mode, rgb[rows], mask[rows], seed=seed, shape=(4, 8, 8))
 
     assert torch.equal(noise("shared")[0], noise("shared")[2])
     assert torch.equal(noise("independent", rows=[2])[0], noise("independent")[2])
@@ -98,9 +98,9 @@ def test_noise_follows_seed_and_content() -> None:
 
 def test_resizing_keeps_edges_on_edges() -> None:
     ramp = torch.arange(0, 128, 2, dtype=torch.uint8).view(1, 1, 64, 1).expand(1, 64, 64, 3)
-    image = network_image(ramp, size=256)
+    image = to_network_image(ramp, size=256)
     # pixel x of 256 lies at (x + .5) / 4 - .5 of 64; value 2 x there, away from the border
     expected = 2 * ((torch.arange(256) + 0.5) / 4 - 0.5) / 127.5 - 1
     torch.testing.assert_close(image[0, 0, 0, 4:-4], expected[4:-4], rtol=0, atol=1e-6)
-    assert network_image(ramp, size=64).max() < 0
-    assert tuple(network_image(ramp, size=32).shape) == (1, 3, 32, 32)
+    assert to_network_image(ramp, size=64).max() < 0
+    assert tuple(to_network_image(ramp, size=32).shape) == (1, 3, 32, 32)

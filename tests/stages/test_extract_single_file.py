@@ -147,7 +147,7 @@ def test_shapes_alone_give_the_configuration(both: tuple[Path, Path]) -> None:
     folder, file = (extractor(path) for path in both)
     for k in range(12):
         assert file.feature_shape(k) == folder.feature_shape(k)
-    ours, theirs = file.architecture(), folder.architecture()
+    ours, theirs = file.configs, folder.configs
     for name in ("block_out_channels", "layers_per_block", "cross_attention_dim", "attention_head_dim"):
         assert ours.unet[name] == theirs.unet[name]
     np.testing.assert_array_equal(ours.alphas_cumprod, theirs.alphas_cumprod)

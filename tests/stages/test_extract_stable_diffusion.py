@@ -13,7 +13,7 @@ from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from make_sd15 import unet_config, write_folder
 from transformers import CLIPTextModel
 
-from pipeline.backbones.stable_diffusion.decoder import decoder_maps, map_shape
+from pipeline.backbones.stable_diffusion.decoder import map_shape, read_decoder_maps
 from pipeline.backbones.stable_diffusion.features import DiffusionBackbone
 from pipeline.errors import BadInput
 from pipeline.items.features import FeatureMaps
@@ -51,7 +51,7 @@ def loaded(folder: Path, dtype: str = "float32", prompt: str = "") -> DiffusionB
 def features(folder: Path, crops: Crops, layers: Sequence[int], **fields: object) -> FeatureMaps:
     spec = extractor(folder, **fields)
     base = loaded(folder, spec.dtype, spec.prompt)
-    return DiffusionBackbone(spec, base.architecture, base.model, batch=4)(crops, layers)
+    return DiffusionBackbone(spec, base.configs, base.model, batch=4)(crops, layers)
 
 
 def some_crops(n: int = 4, size: int = 64) -> Crops:
@@ -189,7 +189,7 @@ def test_without_noise_the_latent_is_clean_and_the_timestep_still_counts(sd1: Pa
     backbone = spec.load(CPU)
     with torch.no_grad():
         latent = backbone._latent(crops.rgb)
-        expected = decoder_maps(backbone.model.unet, latent, 261, backbone.model.prompt, layers=layers, hook="pre")
+        expected = read_decoder_maps(backbone.model.unet, latent, 261, backbone.model.prompt, layers=layers, hook="pre")
     assert_close(backbone(crops, layers)[8], expected[8])
     at_zero = features(sd1, crops, layers, noise="none", timestep=0)[8]
     assert (at_zero - expected[8]).abs().max() > 1e-3
@@ -249,7 +249,7 @@ def test_sizes_and_channels_on_the_configuration_of_sd15(tmp_path: Path) -> None
     for size in (32, 64):
         latent, prompt = torch.empty((1, 4, size, size), device="meta"), torch.empty((1, 77, 768), device="meta")
         for hook in HOOKS:
-            maps = decoder_maps(unet, latent, 50, prompt, layers=LAYERS, hook=hook)
+            maps = read_decoder_maps(unet, latent, 50, prompt, layers=LAYERS, hook=hook)
             for k in LAYERS:
                 assert tuple(maps[k].shape[1:]) == map_shape(config, layer=k, hook=hook, latent_size=size)
 

@@ -15,8 +15,8 @@ from make_vit import CLASS, HEADS, PATCH, REGISTERS, WIDTH, write_vit
 from safetensors.torch import load_file, save_file
 
 from pipeline.backbones.vit.features import VitFeatures
-from pipeline.backbones.vit.source import Architecture
-from pipeline.backbones.vit.transformer import framed, position_grid
+from pipeline.backbones.vit.source import VitSizes
+from pipeline.backbones.vit.transformer import pad_border, resize_positions
 from pipeline.errors import BadInput
 from pipeline.functional import camera
 from pipeline.functional.binning import log_bin
@@ -179,7 +179,7 @@ def test_a_token_lies_where_its_cell_is_centred(
     ramp = np.broadcast_to(np.arange(size, dtype=np.float32), (1, 3, size, size)).copy()
     patch = PATCH[model_type]
     seen = torch.nn.functional.avg_pool2d(
-        framed(torch.from_numpy(ramp), overhang=patch - stride), patch, stride=stride
+        pad_border(torch.from_numpy(ramp), overhang=patch - stride), patch, stride=stride
     )[0, 0, cells // 2]
     assert seen.shape == (cells,)
     centre = camera.cell_to_px(torch.stack([torch.arange(cells)] * 2, 1).double(), size=size, cells=cells)[:, 0]
@@ -191,7 +191,7 @@ def test_positions_follow_the_cells_when_patches_overlap(folders: dict[str, Path
     # twice as many cells: positions interpolated to them, as transformers does for an image twice as large
     folder, crops = folders["vit"], some_crops()
     model = transformers.ViTModel.from_pretrained(folder)
-    ours = position_grid(model.embeddings.position_embeddings[:, 1:], cells=16, antialias=False)
+    ours = resize_positions(model.embeddings.position_embeddings[:, 1:], cells=16, antialias=False)
     theirs = model.embeddings.interpolate_pos_encoding(torch.empty(1, 1 + 16 * 16, WIDTH), 128, 128)[:, 1:]
     assert_close(ours.detach(), theirs.detach())
     assert features(folder, crops, [2], stride=4)[2].shape == (3, WIDTH, 16, 16)
@@ -305,11 +305,11 @@ def test_the_key_follows_the_bytes_and_not_the_place(folder: Path, tmp_path: Pat
 
 
 def test_the_default_shapes_are_those_of_the_published_models() -> None:
-    def shaped(spec: VitFeatures, architecture: Architecture) -> VitFeatures:
-        spec.__dict__["architecture"] = architecture
+    def shaped(spec: VitFeatures, sizes: VitSizes) -> VitFeatures:
+        spec.__dict__["sizes"] = sizes
         return spec
 
-    vits8 = Architecture(width=384, depth=12, heads=6, patch=8, registers=0)
+    vits8 = VitSizes(width=384, depth=12, heads=6, patch=8, registers=0)
     assert shaped(Dino(), vits8).feature_shape(11) == (384, 28, 28)
     zs6d = shaped(Dino(stride=4, binned=(9,)), vits8)
     assert [zs6d.feature_shape(layer) for layer in (11, 9, SALIENCY_LAYER)] == [
@@ -317,7 +317,7 @@ def test_the_default_shapes_are_those_of_the_published_models() -> None:
         (6528, 56, 56),
         (1, 56, 56),
     ]
-    large = shaped(DinoV2(), Architecture(width=1024, depth=24, heads=16, patch=14, registers=4))
+    large = shaped(DinoV2(), VitSizes(width=1024, depth=24, heads=16, patch=14, registers=4))
     assert large.feature_shape(18) == (1024, 30, 30)
     assert large.feature_shape(CLASS_TOKEN_LAYER) == (1024, 1, 1)
 

@@ -12,7 +12,7 @@ from make_sd15 import write_folder
 from safetensors.torch import load_file, save_file
 
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
-from pipeline.backbones.stable_diffusion.source import find
+from pipeline.backbones.stable_diffusion.source import open_weights
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import is_local
 from pipeline.spec import Runtime, build
@@ -67,7 +67,7 @@ def test_every_file_that_is_read_enters_the_key(original: Path, folder: Path, na
 def test_the_noise_schedule_enters_the_key_and_is_obeyed(original: Path, folder: Path) -> None:
     edit(folder / "scheduler" / "scheduler_config.json", beta_end=0.02)
     assert extractor(folder).recipe() != extractor(original).recipe()
-    assert extractor(folder).architecture().alphas_cumprod[-1] < extractor(original).architecture().alphas_cumprod[-1]
+    assert extractor(folder).configs.alphas_cumprod[-1] < extractor(original).configs.alphas_cumprod[-1]
 
 
 def test_a_file_nobody_reads_does_not_enter_the_key(original: Path, folder: Path) -> None:
@@ -230,5 +230,5 @@ def test_broken_files_are_named(folder: Path) -> None:
 
 
 def test_loading_twice_gives_the_same_weights(original: Path) -> None:
-    first, second = (find(str(original), None).unet(torch.float32).state_dict() for _ in range(2))
+    first, second = (open_weights(str(original), None).unet(torch.float32).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)

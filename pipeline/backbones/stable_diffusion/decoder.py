@@ -19,7 +19,7 @@ class _Reached(Exception):
     """The deepest block asked for has answered; the rest of the U-Net is not computed."""
 
 
-def block_count(unet: Mapping[str, Any]) -> int:
+def count_blocks(unet: Mapping[str, Any]) -> int:
     """Number of decoder blocks of a U-Net's config."""
     return len(unet["block_out_channels"]) * (unet["layers_per_block"] + 1)
 
@@ -38,7 +38,7 @@ def map_shape(unet: Mapping[str, Any], *, layer: int, hook: Hook, latent_size: i
     return channels[-1 - up_block], side, side
 
 
-def tapped_module(unet: Any, *, layer: int, hook: Hook) -> nn.Module:
+def find_tapped_module(unet: Any, *, layer: int, hook: Hook) -> nn.Module:
     """The module whose output is the map of block ``layer``.
 
     ``pre``: what enters the block before the skip is concatenated, i.e. the output of block ``layer`` - 1 or of the mid
@@ -46,7 +46,7 @@ def tapped_module(unet: Any, *, layer: int, hook: Hook) -> nn.Module:
     ``resnet``: the residual branch, before the shortcut is added.
     """
     if hook == "pre":
-        return unet.mid_block if layer == 0 else tapped_module(unet, layer=layer - 1, hook="post")
+        return unet.mid_block if layer == 0 else find_tapped_module(unet, layer=layer - 1, hook="post")
     up_block, resnet = _locate(unet, layer)
     if hook == "resnet":
         return up_block.resnets[resnet].conv2
@@ -55,7 +55,7 @@ def tapped_module(unet: Any, *, layer: int, hook: Hook) -> nn.Module:
     return up_block.attentions[resnet] if hasattr(up_block, "attentions") else up_block.resnets[resnet]
 
 
-def decoder_maps(
+def read_decoder_maps(
     unet: nn.Module,
     latent: Float[Tensor, "n c h w"],
     timestep: int,
@@ -76,7 +76,7 @@ def decoder_maps(
 
         return listener
 
-    taps = [tapped_module(unet, layer=k, hook=hook).register_forward_hook(keep(k)) for k in wanted]
+    taps = [find_tapped_module(unet, layer=k, hook=hook).register_forward_hook(keep(k)) for k in wanted]
     try:
         unet(latent, torch.tensor(timestep, device=latent.device), prompt.expand(len(latent), -1, -1))
     except _Reached:

@@ -18,14 +18,14 @@ from pipeline.backbones.stable_diffusion.configs import (
     check_latents,
     check_unet,
 )
-from pipeline.backbones.stable_diffusion.features import Architecture
+from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
 from pipeline.backbones.stable_diffusion.loading import (
-    empty_model,
-    empty_prompt,
-    empty_text_encoder,
+    allocate_model,
+    build_text_encoder,
+    drop_decoder,
     fill,
     last_hidden_state,
-    without_decoder,
+    tokenize_empty_prompt,
 )
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, first_line, list_pickles, list_shards, read_json
@@ -51,7 +51,7 @@ class DiffusersFolder:
         paths += [self.root / "tokenizer" / name for name in _TOKENIZER_FILES]
         return {path.relative_to(self.root).as_posix(): path for path in paths if path.exists()}
 
-    def architecture(self) -> Architecture:
+    def read_configs(self) -> DiffusionConfigs:
         """See Weights."""
         if (self.root / "text_encoder_2").exists():
             raise BadInput(
@@ -63,7 +63,9 @@ class DiffusersFolder:
         check_fields(vae, ("block_out_channels",), self._json("vae"))
         check_latents(unet, vae, self._json("unet"))
         scheduler = self.root / "scheduler" / "scheduler_config.json"
-        return Architecture(unet, vae, alphas_cumprod(read_json(scheduler) if scheduler.exists() else {}, scheduler))
+        return DiffusionConfigs(
+            unet, vae, alphas_cumprod(read_json(scheduler) if scheduler.exists() else {}, scheduler)
+        )
 
     def unet(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
@@ -75,7 +77,7 @@ class DiffusersFolder:
         """See Weights."""
         from diffusers import AutoencoderKL
 
-        return self._filled(without_decoder(self._empty(AutoencoderKL, "vae", dtype)), "vae")
+        return self._filled(drop_decoder(self._empty(AutoencoderKL, "vae", dtype)), "vae")
 
     def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
         """See Weights."""
@@ -84,14 +86,14 @@ class DiffusersFolder:
             found = f"hidden_size {config.get('hidden_size')}"
             raise BadInput(self._json("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
         ids = self._token_ids(text, config)
-        outer, inner = empty_text_encoder(config, self._json("text_encoder"))
+        outer, inner = build_text_encoder(config, self._json("text_encoder"))
         self._filled(inner, "text_encoder")
         return last_hidden_state(outer, ids)
 
     def _token_ids(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
         folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
         if not any((folder / name).exists() for name in ("vocab.json", "tokenizer.json")):
-            return empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
+            return tokenize_empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
         from transformers import CLIPTokenizer
 
         try:
@@ -131,7 +133,7 @@ class DiffusersFolder:
         raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
 
     def _empty(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
-        return empty_model(cls, self._config(part), dtype, self._json(part))
+        return allocate_model(cls, self._config(part), dtype, self._json(part))
 
     def _filled(self, model: nn.Module, part: str) -> nn.Module:
         fill(model, [path for path in self._tensors(part) if path.suffix == ".safetensors"])

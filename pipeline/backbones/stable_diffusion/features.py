@@ -17,10 +17,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
-from pipeline.backbones.determinism import exact_convolutions
-from pipeline.backbones.stable_diffusion.decoder import Hook, block_count, decoder_maps, map_shape
-from pipeline.backbones.stable_diffusion.noise import NoiseMode, draw, noised
+from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
+from pipeline.backbones.determinism import use_deterministic_convolutions
+from pipeline.backbones.stable_diffusion.decoder import Hook, count_blocks, map_shape, read_decoder_maps
+from pipeline.backbones.stable_diffusion.noise import NoiseMode, add_noise, draw_noise
 from pipeline.errors import BadInput
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
@@ -30,7 +30,7 @@ _MOST_CROPS = {"cpu": 16, "cuda": 64}
 
 
 @dataclass(frozen=True, eq=False)
-class Architecture:
+class DiffusionConfigs:
     """What is known of a model before its weights: the configs of U-Net and VAE as diffusers has them, and abar_t."""
 
     unet: Mapping[str, Any]
@@ -59,11 +59,11 @@ class LoadedModel:
 
 @spec
 class DiffusionFeatures(Spec, ABC):
-    """The parameters that all latent diffusion extractors share.
+    """Base of all latent diffusion extractors, with their common parameters.
 
-    ``hook`` picks one of three readings of "layer k", see ``decoder.tapped_module``. ``noise`` "none" passes the clean
-    latent, neither noised nor scaled, at the same timestep. ``ensemble`` averages the features over the noises of
-    ``seed``, ``seed`` + 1, ...
+    ``hook``: what "layer k" means (``decoder.find_tapped_module``). ``noise="none"``: the U-Net gets the clean latent,
+    without noise and unscaled, at the same timestep. ``ensemble``: features are averaged over that many noise samples,
+    drawn with ``seed``, ``seed`` + 1, ...
     """
 
     needs_geometry: ClassVar[bool] = False
@@ -77,8 +77,9 @@ class DiffusionFeatures(Spec, ABC):
     ensemble: Positive = 1
     dtype: Dtype = "float32"
 
+    @property
     @abstractmethod
-    def architecture(self) -> Architecture:
+    def configs(self) -> DiffusionConfigs:
         """Configs alone; no weights are loaded."""
 
     @abstractmethod
@@ -91,51 +92,53 @@ class DiffusionFeatures(Spec, ABC):
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w) of one crop's map. Raises BadInput for a layer, timestep or input size the model does not have."""
-        architecture = self.architecture()
-        _check(self, architecture, (layer,))
-        latent_size = self.input_size // architecture.vae_factor
-        return map_shape(architecture.unet, layer=layer, hook=self.hook, latent_size=latent_size)
+        configs = self.configs
+        _check(self, configs, (layer,))
+        latent_size = self.input_size // configs.vae_factor
+        return map_shape(configs.unet, layer=layer, hook=self.hook, latent_size=latent_size)
 
     def load(self, runtime: Runtime) -> DiffusionBackbone:
         """Weights into memory. Raises BadInput for weights that are missing or of another class."""
-        architecture = self.architecture()
-        _check(self, architecture, ())
+        configs = self.configs
+        _check(self, configs, ())
         device = torch.device(runtime.torch_device())
         model = self.load_model()
         placed = LoadedModel(_ready(model.unet, device), _ready(model.vae, device), model.prompt.to(device))
-        working = _working(self, architecture, device.type)
-        batch = runtime.batch or fitting_batch(working, runtime, device)
-        return DiffusionBackbone(self, architecture, placed, batch)
+        working = _working(self, configs, device.type)
+        batch = runtime.batch or compute_batch_size(working, runtime, device)
+        return DiffusionBackbone(self, configs, placed, batch)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As fitting.Sized: the weights are counted on models without memory."""
         from diffusers import AutoencoderKL, UNet2DConditionModel
 
-        a, working = self.architecture(), _working(self, self.architecture(), device)
-        _check(self, a, layers)
-        values = parameter_count(UNet2DConditionModel, a.unet) + parameter_count(
-            AutoencoderKL, a.vae, without="decoder"
+        working = _working(self, self.configs, device)
+        _check(self, self.configs, layers)
+        values = count_parameters(UNet2DConditionModel, self.configs.unet) + count_parameters(
+            AutoencoderKL, self.configs.vae, without="decoder"
         )
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(values * _bytes_per_value(self), working.a_pass, working.a_crop + maps, working.most)
+        return Footprint(
+            values * _bytes_per_value(self), working.bytes_per_pass, working.bytes_per_crop + maps, working.max_batch
+        )
 
 
 class DiffusionBackbone:
     """A DiffusionFeatures spec with its model in memory."""
 
-    def __init__(self, spec: DiffusionFeatures, architecture: Architecture, model: LoadedModel, batch: int) -> None:
-        self.spec, self.architecture, self.model, self.batch = spec, architecture, model, batch
+    def __init__(self, spec: DiffusionFeatures, configs: DiffusionConfigs, model: LoadedModel, batch: int) -> None:
+        self.spec, self.configs, self.model, self.batch = spec, configs, model, batch
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers in the spec's dtype, on the model's device; at most ``batch`` crops at a time."""
-        _check(self.spec, self.architecture, layers)
+        _check(self.spec, self.configs, layers)
         chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
         # concatenated outside inference mode: the maps are ordinary tensors again, free for use in place
         return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
 
     @torch.inference_mode()
     def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        with exact_convolutions():
+        with use_deterministic_convolutions():
             latent = self._latent(crops.rgb)
             members = 1 if self.spec.noise == "none" else self.spec.ensemble
             return _mean([self._maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
@@ -144,22 +147,22 @@ class DiffusionBackbone:
         # one by one on the CPU, where a batch gains nothing and the VAE's first maps are the largest of all
         step = 1 if self.model.prompt.device.type == "cpu" else len(rgb)
         images = [self._image(rgb[i : i + step]) for i in range(0, len(rgb), step)]
-        return torch.cat([clean_latent(self.model.vae, self.architecture.vae, image) for image in images])
+        return torch.cat([encode_latent(self.model.vae, self.configs.vae, image) for image in images])
 
     def _image(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n 3 H W"]:
         image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self.model.prompt.device)
-        return network_image(image, size=self.spec.input_size).to(self.model.prompt.dtype)
+        return to_network_image(image, size=self.spec.input_size).to(self.model.prompt.dtype)
 
     def _maps(self, crops: Crops, latent: Float[Tensor, "n c h w"], seed: int, layers: Sequence[int]) -> FeatureMaps:
         s = self.spec
         if s.noise != "none":
             shape = (latent.shape[1], latent.shape[2], latent.shape[3])
-            noise = draw(s.noise, crops.rgb, crops.mask, seed=seed, shape=shape).to(latent)
-            latent = noised(latent, noise, alpha_cumprod=float(self.architecture.alphas_cumprod[s.timestep]))
-        return decoder_maps(self.model.unet, latent, s.timestep, self.model.prompt, layers=layers, hook=s.hook)
+            noise = draw_noise(s.noise, crops.rgb, crops.mask, seed=seed, shape=shape).to(latent)
+            latent = add_noise(latent, noise, alpha_cumprod=float(self.configs.alphas_cumprod[s.timestep]))
+        return read_decoder_maps(self.model.unet, latent, s.timestep, self.model.prompt, layers=layers, hook=s.hook)
 
 
-def network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tensor, "n 3 H W"]:
+def to_network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tensor, "n 3 H W"]:
     """Images in [-1, 1], resized with pixel edges on pixel edges (camera.resize_affine); shrinking is antialiased."""
     image = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1
     if image.shape[-1] == size:
@@ -167,7 +170,7 @@ def network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tensor, 
     return interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=image.shape[-1] > size)
 
 
-def clean_latent(vae: Any, config: Mapping[str, Any], image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
+def encode_latent(vae: Any, config: Mapping[str, Any], image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
     """(posterior mean - shift_factor) times scaling_factor (Rombach et al., CVPR 2022, App. G); no draw."""
     mean = vae.encode(image).latent_dist.mean
     return (mean - (config.get("shift_factor") or 0.0)) * config.get("scaling_factor", 0.18215)
@@ -186,8 +189,8 @@ def _ready(model: Any, device: torch.device) -> nn.Module:
     return model.to(device)
 
 
-def _check(spec: DiffusionFeatures, architecture: Architecture, layers: Sequence[int]) -> None:
-    blocks, timesteps, step = block_count(architecture.unet), len(architecture.alphas_cumprod), architecture.size_step
+def _check(spec: DiffusionFeatures, configs: DiffusionConfigs, layers: Sequence[int]) -> None:
+    blocks, timesteps, step = count_blocks(configs.unet), len(configs.alphas_cumprod), configs.size_step
     for layer in layers:
         if not 0 <= layer < blocks:
             raise BadInput("extract layer", found=layer, needed=f"0..{blocks - 1}, the U-Net's {blocks} decoder blocks")
@@ -199,7 +202,7 @@ def _check(spec: DiffusionFeatures, architecture: Architecture, layers: Sequence
         )
 
 
-def parameter_count(cls: Any, config: Mapping[str, Any], *, without: str = "") -> int:
+def count_parameters(cls: Any, config: Mapping[str, Any], *, without: str = "") -> int:
     """Values of a diffusers model, of all its parts but one if told so; nothing is set aside for them."""
     with torch.device("meta"):
         model = cls.from_config(dict(config))
@@ -210,11 +213,11 @@ def _bytes_per_value(spec: DiffusionFeatures) -> int:
     return 4 if spec.dtype == "float32" else 2
 
 
-def _working(spec: DiffusionFeatures, architecture: Architecture, device: str) -> Footprint:
+def _working(spec: DiffusionFeatures, configs: DiffusionConfigs, device: str) -> Footprint:
     """A pass by its largest maps: the VAE's first level, one by one on a CPU, and the U-Net's first with its skips."""
-    latent_size = spec.input_size // architecture.vae_factor
-    unet = 60 * architecture.unet["block_out_channels"][0] * latent_size**2 * _bytes_per_value(spec)
-    vae = 6 * architecture.vae["block_out_channels"][0] * spec.input_size**2 * _bytes_per_value(spec)
+    latent_size = spec.input_size // configs.vae_factor
+    unet = 60 * configs.unet["block_out_channels"][0] * latent_size**2 * _bytes_per_value(spec)
+    vae = 6 * configs.vae["block_out_channels"][0] * spec.input_size**2 * _bytes_per_value(spec)
     if device == "cuda":
         return Footprint(0, 0, unet + vae, _MOST_CROPS[device])
     return Footprint(0, max(0, vae - unet), unet, _MOST_CROPS[device])

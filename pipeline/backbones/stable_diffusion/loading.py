@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.backbones.pretrained import quiet_libraries
+from pipeline.backbones.pretrained import silence_libraries
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import check_missing, first_line, tensor_shapes
 
@@ -20,7 +20,7 @@ _PORTION = 1 << 26  # values read before a file is mapped anew
 _BOS, _EOS = 49406, 49407  # of CLIP's vocabulary (Radford et al., ICML 2021)
 
 
-def empty_prompt(text: str, where: Path, *, open_clip: bool, length: int) -> Int[Tensor, "1 l"]:
+def tokenize_empty_prompt(text: str, where: Path, *, open_clip: bool, length: int) -> Int[Tensor, "1 l"]:
     """Token ids of "" without a tokenizer: begin, end, padding. Raises BadInput for any other text.
 
     Stable Diffusion 1.x pads CLIP's text with the end token, 2.x pads OpenCLIP's with 0.
@@ -33,57 +33,57 @@ def empty_prompt(text: str, where: Path, *, open_clip: bool, length: int) -> Int
     return torch.tensor([[_BOS, _EOS] + [padding] * (length - 2)])
 
 
-def empty_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
+def allocate_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
     """A model of a diffusers class, its memory set aside and not yet written to. Raises BadInput."""
     try:
-        with torch.device("meta"), quiet_libraries():
+        with torch.device("meta"), silence_libraries():
             model = cls.from_config(dict(config)).to(dtype)
     except (ValueError, TypeError, KeyError, IndexError, RuntimeError, NotImplementedError) as error:
         raise BadInput(where, found=first_line(error), needed=f"a config of {cls.__name__}") from None
     return model.to_empty(device="cpu")
 
 
-def empty_unet(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
-    """An empty UNet2DConditionModel. Raises BadInput as ``empty_model``."""
+def allocate_unet(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
+    """An empty UNet2DConditionModel. Raises BadInput as ``allocate_model``."""
     from diffusers import UNet2DConditionModel
 
-    return empty_model(UNet2DConditionModel, config, dtype, where)
+    return allocate_model(UNet2DConditionModel, config, dtype, where)
 
 
-def empty_encoder(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
-    """An empty AutoencoderKL with its encoder alone. Raises BadInput as ``empty_model``."""
+def allocate_encoder(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
+    """An empty AutoencoderKL with its encoder alone. Raises BadInput as ``allocate_model``."""
     from diffusers import AutoencoderKL
 
-    return without_decoder(empty_model(AutoencoderKL, config, dtype, where))
+    return drop_decoder(allocate_model(AutoencoderKL, config, dtype, where))
 
 
-def untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
+def build_untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
     """U-Net and autoencoder of the given configs, freshly initialised: for training."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     return UNet2DConditionModel(**unet), AutoencoderKL(**vae)
 
 
-def empty_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Module, nn.Module]:
+def build_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Module, nn.Module]:
     """A CLIPTextModel, and the part of it that holds the weights: itself, within a wrapper until transformers 5.6."""
     from transformers import CLIPTextConfig, CLIPTextModel
 
     try:
-        with quiet_libraries():
+        with silence_libraries():
             model: Any = CLIPTextModel(CLIPTextConfig.from_dict(dict(config)))
     except (ValueError, TypeError, KeyError, RuntimeError, AttributeError) as error:
         raise BadInput(where, found=first_line(error), needed="a config of CLIPTextModel") from None
     return model, getattr(model, "text_model", model)
 
 
-def current_name(name: str) -> str:
+def modernize_name(name: str) -> str:
     """A weight's name today: no wrapper around the text encoder; the VAE's attention as since diffusers 0.17."""
     name = name.removeprefix("text_model.")
     former = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
     return former[1] + _ATTENTION_NAMES[former[2]] + former[3] if former else name
 
 
-def fill(model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = current_name) -> None:
+def fill(model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = modernize_name) -> None:
     """Weights from safetensors files into a model's own memory. Raises BadInput for ones that do not fit.
 
     ``name_of``: the model's name of a stored tensor. A file stays mapped for some hundred megabytes only: what has been
@@ -131,7 +131,7 @@ def last_hidden_state(text_encoder: nn.Module, ids: Int[Tensor, "1 l"]) -> Float
         return text_encoder.float().eval()(ids)[0].clone()
 
 
-def without_decoder(vae: Any) -> nn.Module:
+def drop_decoder(vae: Any) -> nn.Module:
     """The VAE with its encoder alone."""
     vae.decoder, vae.post_quant_conv = None, None
     return vae

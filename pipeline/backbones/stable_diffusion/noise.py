@@ -13,7 +13,7 @@ from torch import Tensor
 NoiseMode = Literal["shared", "independent", "none"]
 
 
-def draw(
+def draw_noise(
     mode: Literal["shared", "independent"],
     rgb: UInt8[np.ndarray, "n S S 3"],
     mask: Bool[np.ndarray, "n S S"],
@@ -31,7 +31,7 @@ def draw(
     return torch.stack([_gaussian(_content_seed(seed, rgb[i], mask[i]), shape) for i in range(len(rgb))])
 
 
-def noised(
+def add_noise(
     latent: Float[Tensor, "n c h w"], noise: Float[Tensor, "n c h w"], *, alpha_cumprod: float
 ) -> Float[Tensor, "n c h w"]:
     """sqrt(abar_t) z + sqrt(1 - abar_t) eps (Ho et al., NeurIPS 2020, Eq. 4)."""

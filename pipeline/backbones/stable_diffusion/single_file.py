@@ -14,15 +14,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod, check_latents
-from pipeline.backbones.stable_diffusion.features import Architecture
+from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
 from pipeline.backbones.stable_diffusion.loading import (
+    allocate_model,
+    build_text_encoder,
     copy_weight,
-    empty_model,
-    empty_prompt,
-    empty_text_encoder,
+    drop_decoder,
     fill,
     last_hidden_state,
-    without_decoder,
+    tokenize_empty_prompt,
 )
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import check_missing, tensor_shapes
@@ -64,7 +64,7 @@ class SingleFile:
                 raise BadInput(self.path, found=f"no tensor {prefix}*", needed=needed)
         return shapes
 
-    def architecture(self) -> Architecture:
+    def read_configs(self) -> DiffusionConfigs:
         """Configs that the shapes imply; the noise schedule is Stable Diffusion's."""
         try:
             unet, vae = unet_config(below(self.shapes, _UNET)), vae_config(below(self.shapes, _VAE))
@@ -74,15 +74,15 @@ class SingleFile:
         if "label_emb.0.0.weight" in below(self.shapes, _UNET):
             raise BadInput(self.path, found=f"{_UNET}label_emb", needed="Stable Diffusion 1.x or 2.x, not XL")
         check_latents(unet, vae, self.path)
-        return Architecture(unet, vae, alphas_cumprod({}))
+        return DiffusionConfigs(unet, vae, alphas_cumprod({}))
 
     def unet(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
         from diffusers import UNet2DConditionModel
         from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
 
-        config = self.architecture().unet
-        model = empty_model(UNet2DConditionModel, config, dtype, self.path)
+        config = self.read_configs().unet
+        model = allocate_model(UNet2DConditionModel, config, dtype, self.path)
         # names in place of tensors: the converter of a U-Net does nothing but rename
         theirs = convert_ldm_unet_checkpoint({n: n for n in self.shapes if n.startswith(_UNET)}, dict(config))
         fill(model, [self.path], {stored: name for name, stored in theirs.items()}.get)
@@ -93,8 +93,8 @@ class SingleFile:
         from diffusers import AutoencoderKL
         from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
 
-        config = self.architecture().vae
-        model = without_decoder(empty_model(AutoencoderKL, config, dtype, self.path))
+        config = self.read_configs().vae
+        model = drop_decoder(allocate_model(AutoencoderKL, config, dtype, self.path))
         return self._filled(model, convert_ldm_vae_checkpoint(self._tensors(_VAE), dict(config)))
 
     def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
@@ -108,8 +108,8 @@ class SingleFile:
         except KeyError as error:
             needed = "the text encoder of CLIP or OpenCLIP"
             raise BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed) from None
-        ids = empty_prompt(text, self.path, open_clip=is_open, length=config["max_position_embeddings"])
-        outer, inner = empty_text_encoder(config, self.path)
+        ids = tokenize_empty_prompt(text, self.path, open_clip=is_open, length=config["max_position_embeddings"])
+        outer, inner = build_text_encoder(config, self.path)
         self._filled(inner, state)
         return last_hidden_state(outer, ids)
 

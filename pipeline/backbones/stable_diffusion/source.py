@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.backbones.stable_diffusion.diffusers_folder import FIELD, NAME, DiffusersFolder, download
-from pipeline.backbones.stable_diffusion.features import Architecture
+from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
 from pipeline.backbones.stable_diffusion.single_file import SingleFile
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import is_local, sweep_hint
@@ -24,7 +24,7 @@ class Weights(Protocol):
         """The files whose bytes decide the features."""
         ...
 
-    def architecture(self) -> Architecture:
+    def read_configs(self) -> DiffusionConfigs:
         """Configs, checked to be Stable Diffusion 1.x or 2.x. Raises BadInput."""
         ...
 
@@ -41,7 +41,7 @@ class Weights(Protocol):
         ...
 
 
-def find(weights: str, revision: str | None) -> Weights:
+def open_weights(weights: str, revision: str | None) -> Weights:
     """What lies at a hub id, in a diffusers folder, or in one .safetensors file of the original layout."""
     if not is_local(weights):
         return DiffusersFolder(download(weights, revision))

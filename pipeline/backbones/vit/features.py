@@ -22,11 +22,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
-from pipeline.backbones.determinism import exact_convolutions
-from pipeline.backbones.stable_diffusion.features import network_image
-from pipeline.backbones.vit.source import Architecture, TransformersFolder, find
-from pipeline.backbones.vit.transformer import Facet, block_tokens, embedded, framed, standardised
+from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
+from pipeline.backbones.determinism import use_deterministic_convolutions
+from pipeline.backbones.stable_diffusion.features import to_network_image
+from pipeline.backbones.vit.source import TransformersFolder, VitSizes, open_folder
+from pipeline.backbones.vit.transformer import Facet, embed_patches, pad_border, read_block_tokens, standardise
 from pipeline.errors import BadInput
 from pipeline.functional.binning import bin_count, log_bin
 from pipeline.io.checkpoints import tensor_shapes
@@ -70,17 +70,17 @@ class VitFeatures(Spec, ABC):
     @cached_property
     def source(self) -> TransformersFolder:
         """The weights, found (and fetched, for a hub id). Raises BadInput."""
-        return find(self.weights, self.revision, self.model_types, self.kind.partition(".")[2])
+        return open_folder(self.weights, self.revision, self.model_types, self.kind.partition(".")[2])
 
     @cached_property
-    def architecture(self) -> Architecture:
+    def sizes(self) -> VitSizes:
         """Sizes from the config alone. Raises BadInput for weights of another class."""
-        return self.source.architecture()
+        return self.source.read_sizes()
 
     @cached_property
     def weights_digest(self) -> str:
         """sha256 of all files the features depend on. Raises BadInput."""
-        _ = self.architecture  # first: a folder of another class is refused for what it is
+        _ = self.sizes  # first: a folder of another class is refused for what it is
         return files_digest(self.source.files)
 
     @property
@@ -91,7 +91,7 @@ class VitFeatures(Spec, ABC):
     @property
     def stride_px(self) -> int:
         """Pixels of the input from one token to the next."""
-        return self.stride or self.architecture.patch
+        return self.stride or self.sizes.patch
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe; the weights by digest, the stride in pixels, and nothing that cannot matter."""
@@ -105,7 +105,7 @@ class VitFeatures(Spec, ABC):
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w) of one crop's map. Raises BadInput for a layer, stride or input size the model does not have."""
         _check(self, (layer,))
-        cells, width = self.input_size // self.stride_px, self.architecture.width
+        cells, width = self.input_size // self.stride_px, self.sizes.width
         if layer == CLASS_TOKEN_LAYER:
             return width, 1, 1
         if layer == SALIENCY_LAYER:
@@ -117,7 +117,7 @@ class VitFeatures(Spec, ABC):
         _check(self, ())
         device = torch.device(runtime.torch_device())
         model = self.source.model(getattr(torch, self.dtype)).eval().requires_grad_(False).to(device)
-        batch = runtime.batch or fitting_batch(_working(self, device.type), runtime, device)
+        batch = runtime.batch or compute_batch_size(_working(self, device.type), runtime, device)
         return VitBackbone(self, model, device, batch)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
@@ -125,7 +125,9 @@ class VitFeatures(Spec, ABC):
         paths = [path for path in self.source.files.values() if path.suffix == ".safetensors"]
         values = sum(math.prod(shape) for path in paths for shape in tensor_shapes(path).values())
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(values * _bytes_per_value(self), 0, _working(self, device).a_crop + maps, _MOST_CROPS[device])
+        return Footprint(
+            values * _bytes_per_value(self), 0, _working(self, device).bytes_per_crop + maps, _MOST_CROPS[device]
+        )
 
 
 class VitBackbone:
@@ -144,25 +146,25 @@ class VitBackbone:
     @torch.inference_mode()
     def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         s = self.spec
-        with exact_convolutions():
-            found = block_tokens(
+        with use_deterministic_convolutions():
+            found = read_block_tokens(
                 self.model,
-                embedded(self.model, self._image(crops), stride=s.stride_px),
+                embed_patches(self.model, self._image(crops), stride=s.stride_px),
                 layers=layers,
                 facet=s.facet,
                 norm_last=s.norm_last,
                 saliency_heads=_heads(s),
-                skipped=1 + s.architecture.registers,
+                skipped=1 + s.sizes.registers,
             )
             return {layer: self._map(tokens, layer) for layer, tokens in found.items()}
 
     def _image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
-        """What the patches are cut from: the crops at ``input_size``, framed and standardised."""
+        """What the patches are cut from: the crops at ``input_size``, padded and standardised."""
         s = self.spec
         rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
-        image = (network_image(rgb, size=s.input_size) + 1) / 2
-        framed_image = framed(image, overhang=s.architecture.patch - s.stride_px)
-        return standardised(framed_image).to(getattr(torch, s.dtype))
+        image = (to_network_image(rgb, size=s.input_size) + 1) / 2
+        framed_image = pad_border(image, overhang=s.sizes.patch - s.stride_px)
+        return standardise(framed_image).to(getattr(torch, s.dtype))
 
     def _map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
         side = 1 if layer == CLASS_TOKEN_LAYER else self.spec.input_size // self.spec.stride_px
@@ -171,11 +173,11 @@ class VitBackbone:
 
 
 def _heads(spec: VitFeatures) -> Sequence[int]:
-    return range(spec.architecture.heads) if spec.saliency_heads is None else spec.saliency_heads
+    return range(spec.sizes.heads) if spec.saliency_heads is None else spec.saliency_heads
 
 
 def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
-    a, last = spec.architecture, spec.architecture.depth - 1
+    a, last = spec.sizes, spec.sizes.depth - 1
     for layer in layers:
         if not 0 <= layer <= last and layer not in (SALIENCY_LAYER, CLASS_TOKEN_LAYER):
             needed = f"0..{last}, the transformer's {a.depth} blocks, {PSEUDO_LAYERS}"
@@ -200,4 +202,4 @@ def _working(spec: VitFeatures, device: str) -> Footprint:
     """A pass by what is alive within a block and the widest map that is kept."""
     cells = (spec.input_size // spec.stride_px) ** 2
     maps = _LIVE_MAPS + 2 * len(set(spec.binned)) * bin_count(spec.hierarchy)
-    return Footprint(0, 0, maps * spec.architecture.width * cells * _bytes_per_value(spec), _MOST_CROPS[device])
+    return Footprint(0, 0, maps * spec.sizes.width * cells * _bytes_per_value(spec), _MOST_CROPS[device])

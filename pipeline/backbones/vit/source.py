@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from pipeline.backbones.pretrained import load_pretrained, quiet_libraries, whole_text
+from pipeline.backbones.pretrained import full_text, load_pretrained, silence_libraries
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, is_local, list_pickles, list_shards, read_json, sweep_hint
 
@@ -26,7 +26,7 @@ _PATTERNS = ["config.json", _INDEX, _SINGLE, "model-[0-9]*-of-[0-9]*.safetensors
 
 
 @dataclass(frozen=True)
-class Architecture:
+class VitSizes:
     """What is known of a transformer before its weights. ``patch``: side in pixels; ``registers``: tokens beside."""
 
     width: int
@@ -36,7 +36,7 @@ class Architecture:
     registers: int
 
 
-def find(weights: str, revision: str | None, model_types: tuple[str, ...], name: str) -> TransformersFolder:
+def open_folder(weights: str, revision: str | None, model_types: tuple[str, ...], name: str) -> TransformersFolder:
     """What lies at a hub id or in a local folder. Raises BadInput; ``name``: that of the field below ``weights``."""
     if not is_local(weights):
         return TransformersFolder(fetch_snapshot(weights, revision, _PATTERNS, field=FIELD, name=name), model_types)
@@ -60,7 +60,7 @@ class TransformersFolder:
         """The files whose bytes decide the features, by name."""
         return {path.name: path for path in (self._json, *self._tensors())}
 
-    def architecture(self) -> Architecture:
+    def read_sizes(self) -> VitSizes:
         """Sizes from the config. Raises BadInput for a model of another class."""
         config = self._config()
         registers = getattr(config, "num_register_tokens", 0)
@@ -68,7 +68,7 @@ class TransformersFolder:
             size = getattr(config, name)
             if not isinstance(size, int) or size < 1:
                 raise BadInput(self._json, found=f"{name} {size!r}", needed="a whole number, 1 or more")
-        return Architecture(
+        return VitSizes(
             config.hidden_size, config.num_hidden_layers, config.num_attention_heads, config.patch_size, registers
         )
 
@@ -103,10 +103,10 @@ class TransformersFolder:
 
         cls: Any = getattr(transformers, CLASSES[self._model_type()].removesuffix("Model") + "Config")
         try:
-            with quiet_libraries():
+            with silence_libraries():
                 return cls.from_dict(read_json(self._json))
         except Exception as error:  # what a wrong value raises differs between versions of the library
-            raise BadInput(self._json, found=whole_text(error), needed=f"the fields of a {cls.__name__}") from None
+            raise BadInput(self._json, found=full_text(error), needed=f"the fields of a {cls.__name__}") from None
 
     def _tensors(self) -> list[Path]:
         """One file of weights, or an index and its shards."""

@@ -22,13 +22,13 @@ _PROJECTIONS = {"query": ("q_proj", "query"), "key": ("k_proj", "key"), "value":
 _FIRST_NORM = ("norm1", "layernorm_before")
 
 
-def standardised(image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
+def standardise(image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
     """Images in [0, 1] as DINO and DINOv2 were trained on them: ImageNet's mean and standard deviation."""
     mean, std = (torch.tensor(v, device=image.device).view(3, 1, 1) for v in (_IMAGENET_MEAN, _IMAGENET_STD))
     return (image - mean) / std
 
 
-def framed(image: Float[Tensor, "n 3 S S"], *, overhang: int) -> Float[Tensor, "n 3 R R"]:
+def pad_border(image: Float[Tensor, "n 3 S S"], *, overhang: int) -> Float[Tensor, "n 3 R R"]:
     """Images with half of ``overhang`` more pixels on each side, black as the crop stage has it outside the image.
 
     Half an odd number: black all the same, and the image half a pixel off, bilinear.
@@ -37,7 +37,7 @@ def framed(image: Float[Tensor, "n 3 S S"], *, overhang: int) -> Float[Tensor, "
     return avg_pool2d(image, 2, stride=1) if overhang % 2 else image
 
 
-def embedded(model: Any, image: Float[Tensor, "n 3 S S"], *, stride: int) -> Float[Tensor, "n t c"]:
+def embed_patches(model: Any, image: Float[Tensor, "n 3 S S"], *, stride: int) -> Float[Tensor, "n t c"]:
     """Class token, registers where there are any, and the tokens of all patches, rows first, with their positions.
 
     A patch every ``stride`` pixels, so that patches overlap when it is smaller than they are (Amir et al., ECCVW 2022).
@@ -47,13 +47,13 @@ def embedded(model: Any, image: Float[Tensor, "n 3 S S"], *, stride: int) -> Flo
     patches = conv2d(image, kernel.weight, kernel.bias, stride=stride)
     registers = getattr(parts, "register_tokens", None)
     positions = parts.position_embeddings
-    grid = position_grid(positions[:, 1:], cells=patches.shape[-1], antialias=registers is not None)
+    grid = resize_positions(positions[:, 1:], cells=patches.shape[-1], antialias=registers is not None)
     first = [parts.cls_token + positions[:, :1], *([] if registers is None else [registers])]
     tokens = patches.flatten(2).transpose(1, 2) + grid
     return torch.cat([*(t.expand(len(image), -1, -1) for t in first), tokens], dim=1)
 
 
-def position_grid(positions: Float[Tensor, "1 p c"], *, cells: int, antialias: bool) -> Float[Tensor, "1 t c"]:
+def resize_positions(positions: Float[Tensor, "1 p c"], *, cells: int, antialias: bool) -> Float[Tensor, "1 t c"]:
     """Position embeddings of ``cells`` x ``cells`` tokens: bicubic, grid edges on grid edges, in float32.
 
     ``antialias`` when shrinking, as DINOv2 was trained with registers (Darcet et al., ICLR 2024) and not without.
@@ -66,7 +66,7 @@ def position_grid(positions: Float[Tensor, "1 p c"], *, cells: int, antialias: b
     return resized.flatten(2).transpose(1, 2).to(positions.dtype)
 
 
-def block_tokens(
+def read_block_tokens(
     model: Any,
     tokens: Float[Tensor, "n t c"],
     *,
@@ -81,13 +81,13 @@ def block_tokens(
     Queries, keys and values are those of the block's attention, all heads side by side; "token" is its output, behind
     the model's last norm if ``norm_last``. The pseudo-layers give the class token (n 1 c) and its attention (n t 1).
     """
-    blocks = blocks_of(model)
+    blocks = find_blocks(model)
     last = len(blocks) - 1
     deepest = last if {SALIENCY_LAYER, CLASS_TOKEN_LAYER} & set(layers) else max(layers, default=-1)
     found: dict[int, Tensor] = {}
     for layer, block in enumerate(blocks[: deepest + 1]):
         if layer in layers and facet != "token":
-            found[layer] = projected(block, tokens, facet)[:, skipped:]
+            found[layer] = project_facet(block, tokens, facet)[:, skipped:]
         if layer == last and SALIENCY_LAYER in layers:
             found[SALIENCY_LAYER] = saliency(block, tokens, heads=saliency_heads, model=model, skipped=skipped)
         if layer == deepest and CLASS_TOKEN_LAYER not in layers and not (layer in layers and facet == "token"):
@@ -101,12 +101,12 @@ def block_tokens(
     return found
 
 
-def blocks_of(model: nn.Module) -> nn.ModuleList:
+def find_blocks(model: nn.Module) -> nn.ModuleList:
     """The transformer's blocks, its only list of modules."""
     return next(module for module in model.modules() if isinstance(module, nn.ModuleList))
 
 
-def projected(block: nn.Module, tokens: Float[Tensor, "n t c"], facet: str) -> Float[Tensor, "n t c"]:
+def project_facet(block: nn.Module, tokens: Float[Tensor, "n t c"], facet: str) -> Float[Tensor, "n t c"]:
     """Queries, keys or values of a block's attention, from the tokens that enter the block."""
     return part(block, _PROJECTIONS[facet])(part(block, _FIRST_NORM)(tokens))
 
@@ -119,8 +119,8 @@ def saliency(
     Amir et al., ECCVW 2022, and their code. An image that is the same everywhere gives 0.
     """
     count = model.config.num_attention_heads
-    query = projected(block, tokens[:, :1], "query").unflatten(-1, (count, -1))
-    key = projected(block, tokens, "key").unflatten(-1, (count, -1))
+    query = project_facet(block, tokens[:, :1], "query").unflatten(-1, (count, -1))
+    key = project_facet(block, tokens, "key").unflatten(-1, (count, -1))
     scores = torch.einsum("nshd,nthd->nht", query.float(), key.float()) * key.shape[-1] ** -0.5
     seen = scores.softmax(-1)[:, list(heads), skipped:].mean(1)
     least, most = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)

@@ -39,7 +39,7 @@ class Cropper(Variant, Protocol):
         ...
 
 
-def object_area(
+def locate_object(
     mask: Bool[np.ndarray, "H W"] | None, bbox_xyxy: BBox, size_hw: tuple[int, int]
 ) -> tuple[Bool[np.ndarray, "H W"], BBox]:
     """The object's pixels and their box. With a mask, its own box counts, not the given one.
@@ -60,15 +60,15 @@ def _box_mask(bbox_xyxy: BBox, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H 
     """Pixels whose centre is in the box. Raises NoPose when there is none."""
     x0, y0, x1, y1 = bbox_xyxy
     if not (np.isfinite(bbox_xyxy).all() and x1 > x0 and y1 > y0):
-        raise NoPose("crop", f"box {text_of(bbox_xyxy)} has no area")
+        raise NoPose("crop", f"box {format_box(bbox_xyxy)} has no area")
     x, y = np.arange(size_hw[1]), np.arange(size_hw[0])
     inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
     if not inside.any():
-        raise NoPose("crop", f"box {text_of(bbox_xyxy)} holds no pixel of the {size_hw[1]} x {size_hw[0]} image")
+        raise NoPose("crop", f"box {format_box(bbox_xyxy)} holds no pixel of the {size_hw[1]} x {size_hw[0]} image")
     return inside
 
 
-def text_of(bbox_xyxy: BBox) -> str:
+def format_box(bbox_xyxy: BBox) -> str:
     """A box for messages."""
     return "({:g}, {:g}, {:g}, {:g})".format(*bbox_xyxy)
 

@@ -11,7 +11,7 @@ from pydantic import Field
 from pipeline.functional.camera import square_crop
 from pipeline.functional.resample import resample
 from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.crop import HALF, BBox, object_area
+from pipeline.stages.crop import HALF, BBox, locate_object
 
 
 @spec
@@ -38,8 +38,8 @@ class Square(Spec):
         bbox_xyxy: BBox,
         K: Float[np.ndarray, "3 3"],
     ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
-        """rgb, mask and A_crop_img, a scale and a shift; K plays no part. Raises NoPose as ``object_area`` does."""
-        area, box = object_area(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
+        """rgb, mask and A_crop_img, a scale and a shift; K plays no part. Raises NoPose as ``locate_object`` does."""
+        area, box = locate_object(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
         A_crop_img = square_crop(box, size=self.size, padding_ratio=self.padding_ratio)
         shown = rgb * area[..., None] if self.background == "remove" else rgb
         crop = np.rint(resample(shown, A_crop_img, size=self.size)).clip(0, 255).astype(np.uint8)

@@ -12,7 +12,7 @@ from pipeline.errors import NoPose
 from pipeline.functional.camera import virtual_crop
 from pipeline.functional.resample import warp
 from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.crop import HALF, BBox, object_area, text_of
+from pipeline.stages.crop import HALF, BBox, format_box, locate_object
 
 
 @spec
@@ -45,13 +45,13 @@ class Virtual(Spec):
     ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
         """rgb, mask and the homography A_crop_img = K_virtual R K^-1.
 
-        Raises NoPose as ``object_area`` does, and for a box that no camera can see as a whole.
+        Raises NoPose as ``locate_object`` does, and for a box that no camera can see as a whole.
         """
-        area, box = object_area(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
+        area, box = locate_object(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
         try:
             A_crop_img = virtual_crop(box, K, size=self.size, padding_ratio=self.padding_ratio)
         except ValueError as reason:
-            raise NoPose("crop", f"box {text_of(box)} with this K: {reason}") from None
+            raise NoPose("crop", f"box {format_box(box)} with this K: {reason}") from None
         shown = rgb * area[..., None] if self.background == "remove" else rgb
         both = warp(np.dstack([shown, area]), A_crop_img, size=self.size)
         return np.rint(both[..., :3]).clip(0, 255).astype(np.uint8), both[..., 3] >= HALF, A_crop_img

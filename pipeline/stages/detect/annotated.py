@@ -10,19 +10,19 @@ from pipeline.bop.scene import GroundTruth
 from pipeline.items.views import Target
 
 
-def annotated(dataset: Dataset, target: Target) -> list[GroundTruth]:
+def select_instances(dataset: Dataset, target: Target) -> list[GroundTruth]:
     """The target's ``inst_count`` most visible instances, as bop_toolkit chooses them; ties in file order."""
     instances = [gt for gt in dataset.ground_truth(target.scene_id, target.im_id) if gt.obj_id == target.obj_id]
     return sorted(instances, key=lambda gt: -(gt.visib_fract or 0.0))[: target.inst_count]
 
 
-def annotation_files(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+def annotation_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
     """scene_gt.json and, where it is there, scene_gt_info.json of the targets' scenes."""
     folders = [dataset.scene(scene_id).folder for scene_id in sorted({target.scene_id for target in targets})]
     infos = [folder / "scene_gt_info.json" for folder in folders]
     return [folder / "scene_gt.json" for folder in folders] + [path for path in infos if path.exists()]
 
 
-def photographs(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+def image_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
     """The targets' images; masks must have their size."""
     return [dataset.image_path(*image) for image in sorted({(t.scene_id, t.im_id) for t in targets})]

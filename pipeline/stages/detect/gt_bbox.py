@@ -12,7 +12,7 @@ from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Spec, spec
-from pipeline.stages.detect.annotated import annotated, annotation_files
+from pipeline.stages.detect.annotated import annotation_paths, select_instances
 
 
 @spec
@@ -30,7 +30,7 @@ class GtBbox(Spec):
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """Annotations of the scenes."""
-        return annotation_files(dataset, targets)
+        return annotation_paths(dataset, targets)
 
     def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
         """One detection per annotated instance. Raises BadInput for a scene without scene_gt_info.json."""
@@ -40,7 +40,7 @@ class GtBbox(Spec):
                 raise BadInput(
                     describe_place(path, scene=scene_id), found="no such file", needed=f"bbox_{self.bbox} of instances"
                 )
-        return [self._detection(target, gt) for target in targets for gt in annotated(dataset, target)]
+        return [self._detection(target, gt) for target in targets for gt in select_instances(dataset, target)]
 
     def _detection(self, target: Target, gt: GroundTruth) -> Detection:
         box = gt.bbox_visib_xyxy if self.bbox == "visib" else gt.bbox_obj_xyxy

@@ -13,7 +13,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Spec, spec
-from pipeline.stages.detect.annotated import annotated, annotation_files, photographs
+from pipeline.stages.detect.annotated import annotation_paths, image_paths, select_instances
 
 
 @spec
@@ -34,14 +34,14 @@ class GtMask(Spec):
         masks = [
             dataset.mask_path(target.scene_id, target.im_id, gt.gt_id, visible=self.visible)
             for target in targets
-            for gt in annotated(dataset, target)
+            for gt in select_instances(dataset, target)
         ]
-        files = annotation_files(dataset, targets) + photographs(dataset, targets)
+        files = annotation_paths(dataset, targets) + image_paths(dataset, targets)
         return files + [path for path in masks if path.exists()]
 
     def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
         """One detection per annotated instance of the targets."""
-        return [self._detection(dataset, target, gt) for target in targets for gt in annotated(dataset, target)]
+        return [self._detection(dataset, target, gt) for target in targets for gt in select_instances(dataset, target)]
 
     def _detection(self, dataset: Dataset, target: Target, gt: GroundTruth) -> Detection:
         ids = target.scene_id, target.im_id

@@ -17,7 +17,7 @@ from pipeline.functional.camera import mask_bbox
 from pipeline.io.digests import file_digest
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.detect.annotated import photographs
+from pipeline.stages.detect.annotated import image_paths
 
 
 @spec
@@ -43,7 +43,7 @@ class Json(Spec):
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """The file, and the photographs for their size."""
-        return [self._file(), *photographs(dataset, targets)]
+        return [self._file(), *image_paths(dataset, targets)]
 
     def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
         """The kept detections of each target, best score first. Raises BadInput for a file of another kind."""

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from pydantic import Field
 
-from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
 from pipeline.backbones.grid import CELLS, cells_of
 from pipeline.errors import BadInput
 from pipeline.functional import camera, rigid
@@ -50,7 +50,7 @@ class Coordinates(Spec):
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As fitting.Sized: the points of a map's cells, float64, and the maps."""
         maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(0, 0, 8 * FINEST**2 * (12 + 2 * self.channels) + maps, most=64)
+        return Footprint(0, 0, 8 * FINEST**2 * (12 + 2 * self.channels) + maps, max_batch=64)
 
     def load(self, runtime: Runtime) -> CoordinatesBackbone:
         """Nothing to load."""
@@ -63,7 +63,7 @@ class CoordinatesBackbone:
     def __init__(self, spec: Coordinates, runtime: Runtime) -> None:
         self.device = torch.device(runtime.torch_device())
         footprint = spec.footprint(tuple(CELLS), 0)
-        self.batch = runtime.batch or fitting_batch(footprint, runtime, self.device)
+        self.batch = runtime.batch or compute_batch_size(footprint, runtime, self.device)
         self.spec = spec
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -19,8 +19,13 @@ from torch import Tensor, nn
 
 from pipeline.backbones.batching import Footprint, maps_bytes
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
-from pipeline.backbones.stable_diffusion.features import Architecture, DiffusionBackbone, DiffusionFeatures, LoadedModel
-from pipeline.backbones.stable_diffusion.loading import empty_encoder, empty_unet
+from pipeline.backbones.stable_diffusion.features import (
+    DiffusionBackbone,
+    DiffusionConfigs,
+    DiffusionFeatures,
+    LoadedModel,
+)
+from pipeline.backbones.stable_diffusion.loading import allocate_encoder, allocate_unet
 from pipeline.backbones.stable_diffusion.noise import NoiseMode
 from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES, ORIENTATIONS, edge_histograms
@@ -57,45 +62,54 @@ class Embedded(DiffusionFeatures):
     @property
     def model(self) -> str:
         """``embedded-pure-`` or ``embedded-learned-`` and 8 digits of the digest of the weights."""
-        return f"embedded-{self.weights}-{self._digest()[:8]}"
+        return f"embedded-{self.weights}-{self.weights_digest[:8]}"
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """As DiffusionFeatures.feature_shape; layer 12 has two cells a side for each of the latent's."""
         if layer != EDGES:
             return super().feature_shape(layer)
-        cells = 2 * self.input_size // self.architecture().vae_factor
+        cells = 2 * self.input_size // self.configs.vae_factor
         return ORIENTATIONS, cells, cells
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As DiffusionFeatures.footprint; edges are made after the passes, in less than these take."""
         most = super().footprint(_decoder(layers), crop_size, device)
         edges = [self.feature_shape(layer) for layer in layers if layer == EDGES]
-        return replace(most, a_crop=most.a_crop + maps_bytes(edges))
+        return replace(most, bytes_per_crop=most.bytes_per_crop + maps_bytes(edges))
 
     def load(self, runtime: Runtime) -> EmbeddedBackbone:
         """As DiffusionFeatures.load."""
         decoder = super().load(runtime)
-        return EmbeddedBackbone(self, decoder.architecture, decoder.model, decoder.batch)
+        return EmbeddedBackbone(self, decoder.configs, decoder.model, decoder.batch)
 
     def recipe(self) -> dict[str, Any]:
         """As DiffusionFeatures.recipe, with the digest of the weights behind the name of the set."""
-        return super().recipe() | {"weights": f"{self.weights} {self._digest()}"}
+        return super().recipe() | {"weights": f"{self.weights} {self.weights_digest}"}
 
-    def architecture(self) -> Architecture:
-        """Configs as shipped."""
-        config = shipped_config()
-        return Architecture(config["unet"], config["vae"], alphas_cumprod(config["scheduler"]))
+    @cached_property
+    def configs(self) -> DiffusionConfigs:
+        """Configs as shipped. Raises BadInput where the model is not installed."""
+        path = FOLDER / "config.json"
+        if not path.exists():
+            raise BadInput(path, found="nothing", needed="the embedded model (make train-embedded), or another extract")
+        config = json.loads(path.read_text())
+        return DiffusionConfigs(config["unet"], config["vae"], alphas_cumprod(config["scheduler"]))
 
     def load_model(self) -> LoadedModel:
         """The shipped weights, float16 on disk."""
-        a, dtype = self.architecture(), getattr(torch, self.dtype)
-        unet = _filled(empty_unet(a.unet, dtype), FOLDER / f"unet_{self.weights}.safetensors")
-        vae = empty_encoder(a.vae, dtype)
-        return LoadedModel(unet, _filled(vae, FOLDER / "vae.safetensors"), torch.zeros(PROMPT, dtype=dtype))
+        dtype = getattr(torch, self.dtype)
+        unet = _load_weights(allocate_unet(self.configs.unet, dtype), FOLDER / f"unet_{self.weights}.safetensors")
+        vae = allocate_encoder(self.configs.vae, dtype)
+        return LoadedModel(unet, _load_weights(vae, FOLDER / "vae.safetensors"), torch.zeros(PROMPT, dtype=dtype))
 
-    def _digest(self) -> str:
-        files = [FOLDER / name for name in ("config.json", f"unet_{self.weights}.safetensors", "vae.safetensors")]
-        return digest([_digest_of(path) for path in files])
+    @cached_property
+    def weights_digest(self) -> str:
+        """sha256 of configs and weights. Raises BadInput for a file that is missing."""
+        paths = [FOLDER / name for name in ("config.json", f"unet_{self.weights}.safetensors", "vae.safetensors")]
+        for path in paths:
+            if not path.exists():
+                raise BadInput(path, found="nothing", needed="the embedded model's weights (make train-embedded)")
+        return digest([file_digest(path) for path in paths])
 
 
 class EmbeddedBackbone(DiffusionBackbone):
@@ -120,23 +134,7 @@ def _decoder(layers: Sequence[int]) -> list[int]:
     return [layer for layer in layers if layer != EDGES]
 
 
-@lru_cache(maxsize=1)
-def shipped_config() -> dict[str, Any]:
-    """Configs of U-Net, VAE and scheduler as diffusers has them, and of the head. Raises BadInput without them."""
-    path = FOLDER / "config.json"
-    if not path.exists():
-        raise BadInput(path, found="nothing", needed="the embedded model (make train-embedded), or another extract")
-    return dict(json.loads(path.read_text()))
-
-
-@lru_cache(maxsize=8)
-def _digest_of(path: Path) -> str:
-    if not path.exists():
-        raise BadInput(path, found="nothing", needed="the embedded model's weights (make train-embedded)")
-    return file_digest(path)
-
-
-def _filled(model: nn.Module, path: Path) -> nn.Module:
+def _load_weights(model: nn.Module, path: Path) -> nn.Module:
     from safetensors.torch import load_file
 
     wanted = model.state_dict()

@@ -118,8 +118,16 @@ class Fusion(Spec):
         first = _sized(self.first, "first").footprint(layers, crop_size, device)
         second = _sized(self.second, "second").footprint([self.partner(k) for k in layers], crop_size, device)
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        a_pass, a_crop = max(first.a_pass, second.a_pass), max(first.a_crop, second.a_crop) + maps
-        return Footprint(first.weights + second.weights, a_pass, a_crop, min(first.most, second.most))
+        bytes_per_pass, bytes_per_crop = (
+            max(first.bytes_per_pass, second.bytes_per_pass),
+            max(first.bytes_per_crop, second.bytes_per_crop) + maps,
+        )
+        return Footprint(
+            first.weight_bytes + second.weight_bytes,
+            bytes_per_pass,
+            bytes_per_crop,
+            min(first.max_batch, second.max_batch),
+        )
 
     def load(self, runtime: Runtime) -> FusionBackbone:
         """Weights of both into memory. Raises BadInput for weights that are missing or of another class."""

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
 from pipeline.backbones.grid import CELLS, cells_of
 from pipeline.functional.gradients import append_neighbours, cell_means, oriented_energy, smooth_histograms
 from pipeline.items.features import FeatureMaps
@@ -54,7 +54,7 @@ class Hog(Spec):
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As fitting.Sized: gradients of three channels, energies by orientation, and the maps with their context."""
         maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(0, 0, 4 * (28 + 3 * self.orientations) * crop_size**2 + maps, most=32)
+        return Footprint(0, 0, 4 * (28 + 3 * self.orientations) * crop_size**2 + maps, max_batch=32)
 
     def load(self, runtime: Runtime) -> HogBackbone:
         """Nothing to load."""
@@ -67,7 +67,7 @@ class HogBackbone:
     def __init__(self, spec: Hog, runtime: Runtime) -> None:
         self.spec, self.device = spec, torch.device(runtime.torch_device())
         footprint = spec.footprint(tuple(CELLS), _CROP_PX)
-        self.batch = runtime.batch or fitting_batch(footprint, runtime, self.device)
+        self.batch = runtime.batch or compute_batch_size(footprint, runtime, self.device)
 
     @torch.no_grad()
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate, pixel_unshuffle
 
-from pipeline.backbones.batching import Footprint, fitting_batch, maps_bytes
+from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
 from pipeline.backbones.grid import CELLS, cells_of
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
@@ -38,7 +38,7 @@ class Pixels(Spec):
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As fitting.Sized."""
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(0, 0, 24 * crop_size**2 + maps, most=64)  # float32 colours, twice
+        return Footprint(0, 0, 24 * crop_size**2 + maps, max_batch=64)  # float32 colours, twice
 
     def load(self, runtime: Runtime) -> PixelsBackbone:
         """Nothing to load."""
@@ -51,7 +51,7 @@ class PixelsBackbone:
     def __init__(self, spec: Pixels, runtime: Runtime) -> None:
         self.spec, self.device = spec, torch.device(runtime.torch_device())
         footprint = spec.footprint(tuple(CELLS), _CROP_PX)
-        self.batch = runtime.batch or fitting_batch(footprint, runtime, self.device)
+        self.batch = runtime.batch or compute_batch_size(footprint, runtime, self.device)
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32; a cell that is larger than its colours holds their means."""

@@ -6,6 +6,7 @@ It is not Stable Diffusion and has learned nothing; what it scores is what convo
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from hashlib import sha256
 from typing import Annotated, Any, ClassVar
 
@@ -15,8 +16,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
-from pipeline.backbones.stable_diffusion.features import Architecture, DiffusionFeatures, LoadedModel
-from pipeline.backbones.stable_diffusion.loading import empty_encoder, empty_unet
+from pipeline.backbones.stable_diffusion.features import DiffusionConfigs, DiffusionFeatures, LoadedModel
+from pipeline.backbones.stable_diffusion.loading import allocate_encoder, allocate_unet
 from pipeline.spec import NonNegative, Positive, digest, spec
 
 _PROMPT_TOKENS = 77
@@ -49,20 +50,21 @@ class RandomSD(DiffusionFeatures):
     @property
     def model(self) -> str:
         """``random_sd-`` and 8 digits of the digest of widths and seed."""
-        a = self.architecture()
-        return f"random_sd-{digest([self.version, a.unet, a.vae, self.weights_seed])[:8]}"
+        identity = [self.version, self.configs.unet, self.configs.vae, self.weights_seed]
+        return f"random_sd-{digest(identity)[:8]}"
 
-    def architecture(self) -> Architecture:
+    @cached_property
+    def configs(self) -> DiffusionConfigs:
         """Configs with the spec's widths and Stable Diffusion's noise schedule."""
-        return Architecture(
+        return DiffusionConfigs(
             unet_config(self.channels, self.cross_attention_dim), vae_config(self.vae_channels), alphas_cumprod({})
         )
 
     def load_model(self) -> LoadedModel:
         """The same weights on every machine and in every run."""
-        a, dtype = self.architecture(), getattr(torch, self.dtype)
-        unet = with_random_weights(empty_unet(a.unet, dtype), seed=self.weights_seed)
-        vae = with_random_weights(empty_encoder(a.vae, dtype), seed=self.weights_seed)
+        dtype = getattr(torch, self.dtype)
+        unet = with_random_weights(allocate_unet(self.configs.unet, dtype), seed=self.weights_seed)
+        vae = with_random_weights(allocate_encoder(self.configs.vae, dtype), seed=self.weights_seed)
         prompt = _gaussian("prompt", (1, _PROMPT_TOKENS, self.cross_attention_dim), seed=self.weights_seed)
         return LoadedModel(unet, vae, prompt.to(dtype))
 

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import torch
 
-from pipeline.backbones.stable_diffusion.features import Architecture, DiffusionFeatures, LoadedModel
-from pipeline.backbones.stable_diffusion.source import Weights, find
+from pipeline.backbones.stable_diffusion.features import DiffusionConfigs, DiffusionFeatures, LoadedModel
+from pipeline.backbones.stable_diffusion.source import Weights, open_weights
 from pipeline.io.digests import files_digest
 from pipeline.spec import spec
 
@@ -31,12 +31,12 @@ class StableDiffusion(DiffusionFeatures):
     @cached_property
     def source(self) -> Weights:
         """The weights, found (and fetched, for a hub id). Raises BadInput."""
-        return find(self.weights, self.revision)
+        return open_weights(self.weights, self.revision)
 
     @cached_property
     def weights_digest(self) -> str:
         """sha256 of all files the features depend on. Raises BadInput."""
-        self.architecture()  # first: a folder of another class is refused for what it is
+        _ = self.configs  # checked first, so that a folder of another class is refused by its class
         return files_digest(self.source.files)
 
     @property
@@ -50,13 +50,10 @@ class StableDiffusion(DiffusionFeatures):
         del recipe["revision"]
         return recipe
 
-    def architecture(self) -> Architecture:
-        """Configs of the weights' U-Net, VAE and scheduler."""
-        return self._architecture
-
     @cached_property
-    def _architecture(self) -> Architecture:
-        return self.source.architecture()
+    def configs(self) -> DiffusionConfigs:
+        """Configs of the weights' U-Net, VAE and scheduler. Raises BadInput."""
+        return self.source.read_configs()
 
     def load_model(self) -> LoadedModel:
         """Text encoder first and freed before the U-Net comes: the peak is the U-Net alone."""

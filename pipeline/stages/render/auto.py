@@ -11,13 +11,13 @@ from jaxtyping import Float, Float32, UInt8
 
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
-from pipeline.stages.render.cameras import Studio
+from pipeline.stages.render.cameras import RenderSpec
 from pipeline.stages.render.pyrender import Pyrender
 from pipeline.stages.render.raycast import Raycast
 
 
 @spec
-class Auto(Studio):
+class Auto(RenderSpec):
     """The ray caster where embreex is installed, else pyrender. The templates' key is that of ``resolve()``."""
 
     kind: ClassVar[str] = "render.auto"

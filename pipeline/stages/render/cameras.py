@@ -15,7 +15,7 @@ from pipeline.spec import Fraction, Spec, spec
 
 
 @spec
-class Studio(Spec):
+class RenderSpec(Spec):
     """Where the cameras stand and how the light falls. Every field is explained in conf/render."""
 
     viewpoints: ViewpointSet = "fibonacci"

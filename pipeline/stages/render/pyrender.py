@@ -21,13 +21,13 @@ from pipeline.functional.rigid import inverse
 from pipeline.functional.shading import DEFAULT_GREY, corner_normals, shade
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
-from pipeline.stages.render.cameras import Studio, bounding_sphere
+from pipeline.stages.render.cameras import RenderSpec, bounding_sphere
 
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera looks along -z with y up
 
 
 @spec
-class Pyrender(Studio):
+class Pyrender(RenderSpec):
     """Templates drawn by pyrender. Fields: conf/render/pyrender.yaml."""
 
     kind: ClassVar[str] = "render.pyrender"

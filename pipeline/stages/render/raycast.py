@@ -20,11 +20,11 @@ from pipeline.functional.rigid import transform
 from pipeline.functional.shading import DEFAULT_GREY, corner_normals, mip_levels, shade, texel_density, texture_colour
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
-from pipeline.stages.render.cameras import Studio, bounding_sphere, face_vertices, subpixels
+from pipeline.stages.render.cameras import RenderSpec, bounding_sphere, face_vertices, subpixels
 
 
 @spec
-class Raycast(Studio):
+class Raycast(RenderSpec):
     """Templates drawn by embree. Fields: conf/render/raycast.yaml."""
 
     kind: ClassVar[str] = "render.raycast"

@@ -8,7 +8,7 @@ from pipeline.items.views import Image, Proposal
 from pipeline.spec import Runtime, Variant
 
 
-class Proposing(Protocol):
+class LoadedProposer(Protocol):
     """A proposer with its weights in memory."""
 
     def __call__(self, image: Image) -> list[Proposal]:
@@ -20,6 +20,6 @@ class Proposing(Protocol):
 class Proposer(Variant, Protocol):
     """What a proposals variant is: a spec that decides, with the image's bytes, what is proposed."""
 
-    def load(self, runtime: Runtime) -> Proposing:
+    def load(self, runtime: Runtime) -> LoadedProposer:
         """Weights into memory. Raises BadInput for weights that are missing or of another class."""
         ...

@@ -15,7 +15,7 @@ from PIL import Image as Picture
 from pydantic import Field
 from torch import Tensor
 
-from pipeline.backbones.sam import SamWeights, find
+from pipeline.backbones.sam import SamWeights, open_sam_weights
 from pipeline.bop.masks import encode_rle
 from pipeline.functional.boxes import area, non_maximum_suppression
 from pipeline.functional.camera import mask_bbox
@@ -60,7 +60,7 @@ class Sam(Spec):
     @cached_property
     def source(self) -> SamWeights:
         """The weights, found (and fetched, for a hub id). Raises BadInput."""
-        return find(self.weights, self.revision)
+        return open_sam_weights(self.weights, self.revision)
 
     @cached_property
     def weights_digest(self) -> str:
@@ -77,12 +77,12 @@ class Sam(Spec):
         """What the weights take in memory."""
         return 4 * sum(math.prod(shape) for path in self.source.tensors for shape in tensor_shapes(path).values())
 
-    def load(self, runtime: Runtime) -> SamProposing:
+    def load(self, runtime: Runtime) -> LoadedSam:
         """See Proposer."""
-        return SamProposing(self, self.source.model().to(runtime.torch_device()).eval(), runtime.batch)
+        return LoadedSam(self, self.source.model().to(runtime.torch_device()).eval(), runtime.batch)
 
 
-class SamProposing:
+class LoadedSam:
     """SAM or SAM 2 in memory. ``batch``: points a pass of the mask decoder gets, 0 = the usual 64."""
 
     def __init__(self, spec: Sam, model: Any, batch: int = 0) -> None:
@@ -92,7 +92,7 @@ class SamProposing:
 
     @torch.inference_mode()
     def __call__(self, image: Image) -> list[Proposal]:
-        """See Proposing."""
+        """See LoadedProposer."""
         size_hw = (image.rgb.shape[0], image.rgb.shape[1])
         found = [
             Proposal(box, encode_rle(mask), confidence)
