@@ -15,7 +15,7 @@ from pipeline.bop.dataset import Dataset
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, use_threads
 from pipeline.io.checkpoints import NotDownloaded
-from pipeline.io.digests import remember_in
+from pipeline.io.digests import DigestCache, use_digest_cache
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import PoseErrors
@@ -111,11 +111,12 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     """Run one configuration. Raises DzopError for whatever a user can mend; prints what was done and where it lies."""
     start = time.perf_counter()
     use_threads(options.threads)
-    remember_in(None if store.backend.folder is None else store.backend.folder / ".digests")
     data = dataset.open()
     targets = options.select.of(data)
     context = Context(stages, data, targets, store, runtime, Progress(runtime.progress))
-    with runtime.workers(context, threads=options.threads) as context.workers:
+    folder = store.backend.folder
+    digests = None if folder is None else DigestCache(folder / ".digests")
+    with use_digest_cache(digests), runtime.workers(context, threads=options.threads) as context.workers:
         graph = Graph(context)
         if options.plan:
             _plan(graph, options)

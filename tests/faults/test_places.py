@@ -12,7 +12,7 @@ from helpers import Ground, Undisturbed, store_of, stored, written
 
 import pipeline.io.digests
 import pipeline.store.completion
-from pipeline.io.digests import file_digest, remember_in
+from pipeline.io.digests import DigestCache, file_digest, use_digest_cache
 from pipeline.store.admin import collect, entries
 
 
@@ -148,17 +148,14 @@ def test_entries_completed_in_the_future_are_not_old(quiet: Undisturbed, folder:
 
 
 def test_a_file_that_was_changed_while_the_clock_stood_still_has_another_digest(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(pipeline.io.digests, "_LARGE", 1)
+    monkeypatch.setattr(pipeline.io.digests, "_LARGE_BYTES", 1)
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"one")
-    remember_in(tmp_path / "memo")
-    try:
+    with use_digest_cache(DigestCache(tmp_path / "memo")):
         first, stat = file_digest(path), path.stat()
         assert list((tmp_path / "memo").iterdir())
-        time.sleep(0.02)  # the kernel's own stamp of a change, which nothing but the clock can put back
+        time.sleep(0.02)  # the kernel sets the ctime from its clock; no call can put it back
         path.write_bytes(b"two")
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         assert path.stat().st_mtime_ns == stat.st_mtime_ns
         assert file_digest(path) != first
-    finally:
-        remember_in(None)
