@@ -1,4 +1,4 @@
-"""moto's S3 on this machine: a bucket for tests, and what a broken chunk in it looks like."""
+"""moto's S3 server on this machine, with a bucket for tests."""
 
 from __future__ import annotations
 

@@ -1,30 +1,30 @@
-"""What two stores and two results files must have in common: everything but seconds, which were measured."""
+"""Contents of stores and results files that must be equal between runs: everything except measured seconds."""
 
 from pathlib import Path
 from typing import Any
 
-from pipeline.store import Store, make_ref
-from pipeline.store.admin import entries
+from pipeline.store import Store
+from pipeline.store.admin import list_entries
 
 
 def contents(store: Store) -> dict[str, Any]:
-    """Bytes of every array and every document without its seconds, by path; all entries must be complete."""
+    """Bytes of every array, and every document without measured seconds, by path; all entries must be complete."""
     found: dict[str, Any] = {}
-    for row in entries(store):
-        assert row.state == "complete", row.path
-        entry = store.read(make_ref(row.path.rsplit("/", 1)[0], row.made_from["recipe"], row.made_from["inputs"]))
-        found[row.path] = _untimed(entry.document)
-        found |= {f"{row.path}/{name}": entry.array(name).tobytes() for name in entry.arrays}
+    for info in list_entries(store):
+        assert info.complete, info.path
+        entry = store.read(info.ref)
+        found[info.path] = _remove_times(entry.document)
+        found |= {f"{info.path}/{name}": entry.array(name).tobytes() for name in entry.arrays}
     return found
 
 
 def poses(out: Path) -> bytes:
-    """The one results file below a folder without its last column, the seconds."""
+    """The only results csv below a folder, without its last column, the seconds."""
     (csv,) = out.glob("*/*/*.csv")
     return b"\n".join(line.rpartition(b",")[0] for line in csv.read_bytes().splitlines())
 
 
-def _untimed(value: Any) -> Any:
+def _remove_times(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: _untimed(item) for name, item in value.items() if name not in ("time_s", "times_s")}
-    return [_untimed(item) for item in value] if isinstance(value, list) else value
+        return {name: _remove_times(item) for name, item in value.items() if name not in ("time_s", "times_s")}
+    return [_remove_times(item) for item in value] if isinstance(value, list) else value

@@ -379,7 +379,7 @@ def test_cache_commands_list_measure_verify_and_clean(dzop):
     dzop("step=onboard")
     assert "12" in dzop("cache", "ls", "--long").out
     assert "total" in dzop("cache", "du").out
-    assert "entries whole, 0 not" in dzop("cache", "verify").out
+    assert "entries intact, 0 damaged or incomplete" in dzop("cache", "verify").out
     assert dzop("cache", "gc").out == "0 entries, 0 B\n"
     assert dzop("cache", "gc", "--older-than", "0", "--dry-run").out.count("would remove") > 5
     key = dzop("cache", "ls").out.split("/")[-1].strip()

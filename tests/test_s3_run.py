@@ -1,4 +1,4 @@
-"""A whole run whose store is on S3 leaves the bytes of a local one, and a broken connection one line."""
+"""A run with its store on S3 writes the same bytes as a local run; a lost connection is reported in one line."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def scene(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_run_on_s3_leaves_the_bytes_of_a_local_run(scene, s3, tmp_path, capsys, monkeypatch):
+def test_a_run_on_s3_writes_the_same_bytes_as_a_local_run(scene, s3, tmp_path, capsys, monkeypatch):
     def run(name: str, *overrides: str):
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"out={tmp_path}/{name}")
         return run_dzop(capsys, monkeypatch, *dataset, *SMALL, *overrides)
@@ -36,7 +36,7 @@ def test_a_run_on_s3_leaves_the_bytes_of_a_local_run(scene, s3, tmp_path, capsys
     assert [path for path in ours if ours[path] != theirs[path]] == []
     again = run("s3", *on_s3)
     assert {computed for computed, _ in again.counts()[0].values()} == {0}
-    gone = run("s3", *on_s3[:2], "store.endpoint_url=http://127.0.0.1:1")
-    assert gone.status == 1
-    assert len(gone.err.splitlines()) == 1
-    assert "run again when it answers: what is complete is kept" in gone.err
+    unreachable = run("s3", *on_s3[:2], "store.endpoint_url=http://127.0.0.1:1")
+    assert unreachable.status == 1
+    assert len(unreachable.err.splitlines()) == 1
+    assert "run again when it answers: completed entries are kept" in unreachable.err

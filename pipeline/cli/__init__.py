@@ -1,1 +1,1 @@
-"""Commands beside the route: ``dzop cache``, ``dzop score`` and ``dzop lint``."""
+"""Commands other than running the pipeline: ``dzop cache``, ``dzop score`` and ``dzop lint``."""

@@ -1,4 +1,4 @@
-"""``dzop cache``: the store from the command line."""
+"""``dzop cache``: inspect, verify and clean up the feature store."""
 
 from __future__ import annotations
 
@@ -10,38 +10,42 @@ from pathlib import Path
 from pipeline.errors import DzopError
 from pipeline.progress import format_bytes
 from pipeline.store import LocalStoreConfig, S3StoreConfig, Store
-from pipeline.store.admin import Row, collect, entries, find, verify
+from pipeline.store.admin import EntryInfo, collect_garbage, find_entry, list_entries, verify
 
 
 def cache_command(arguments: list[str]) -> None:
-    """Parse and run one ``dzop cache`` command; output on stdout."""
-    place = argparse.ArgumentParser(add_help=False)
-    place.add_argument("--root", default="cache", help="the store: a folder or s3://bucket/prefix (default: cache)")
-    parser = argparse.ArgumentParser(prog="dzop cache", description="Look after the feature store.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    ls = commands.add_parser("ls", parents=[place], help="every entry: state, rows, size, age, what it is")
-    ls.add_argument("--long", action="store_true", help="also what each entry was made from")
-    commands.add_parser("du", parents=[place], help="bytes by folder")
-    commands.add_parser("verify", parents=[place], help="read and check every byte; damaged entries become incomplete")
-    gc = commands.add_parser("gc", parents=[place], help="remove incomplete entries, and old ones if asked")
-    gc.add_argument("--older-than", type=_days, metavar="DAYS", help="also complete entries older than this")
-    gc.add_argument("--dry-run", action="store_true", help="only say what would go")
-    path = commands.add_parser("path", parents=[place], help="where an entry lies and what it was made from")
-    path.add_argument("key", help="the first digits of its key")
-    asked = parser.parse_args(arguments)
-    store = _open(asked.root)
-    if asked.command == "ls":
-        _ls(entries(store), long=asked.long)
-    elif asked.command == "du":
-        _du(entries(store))
-    elif asked.command == "verify":
+    """Parse and run one ``dzop cache`` command; prints to stdout. Raises DzopError for a folder that is no store."""
+    options = _parser().parse_args(arguments)
+    store = _open(options.root)
+    if options.command == "ls":
+        _print_entries(list_entries(store), long=options.long)
+    elif options.command == "du":
+        _print_sizes(list_entries(store))
+    elif options.command == "verify":
         _verify(store)
-    elif asked.command == "gc":
-        _gc(store, asked.older_than, dry_run=asked.dry_run)
+    elif options.command == "gc":
+        _collect_garbage(store, options.older_than, dry_run=options.dry_run)
     else:
-        row = find(store, asked.key)
-        print(f"{store.place}/{row.path}")
-        print(json.dumps(row.made_from, indent=2, sort_keys=True))
+        entry = find_entry(store, options.key)
+        print(f"{store.place}/{entry.path}")
+        print(json.dumps(entry.made_from, indent=2, sort_keys=True))
+
+
+def _parser() -> argparse.ArgumentParser:
+    root = argparse.ArgumentParser(add_help=False)
+    root.add_argument("--root", default="cache", help="the store: a folder or s3://bucket/prefix (default: cache)")
+    parser = argparse.ArgumentParser(prog="dzop cache", description="Inspect, verify and clean up the feature store.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    ls = commands.add_parser("ls", parents=[root], help="list entries: state, rows, size, age and path")
+    ls.add_argument("--long", action="store_true", help="also print what each entry was made from")
+    commands.add_parser("du", parents=[root], help="print the size of each folder")
+    commands.add_parser("verify", parents=[root], help="check every byte; damaged entries are marked incomplete")
+    gc = commands.add_parser("gc", parents=[root], help="delete incomplete entries, and optionally old ones")
+    gc.add_argument("--older-than", type=_days, metavar="DAYS", help="also delete complete entries older than DAYS")
+    gc.add_argument("--dry-run", action="store_true", help="only print what would be deleted")
+    path = commands.add_parser("path", parents=[root], help="print an entry's path and what it was made from")
+    path.add_argument("key", help="the first digits of the entry's key")
+    return parser
 
 
 def _days(text: str) -> float:
@@ -57,43 +61,57 @@ def _open(root: str) -> Store:
     if not Path(root).is_dir():
         raise DzopError(f"{root}: found no such folder, needs a store (--root)")
     if not (Path(root) / ".locks").is_dir() and any(p.name != ".gitkeep" for p in Path(root).iterdir()):
-        raise DzopError(f"{root}: found a folder that is no store, needs one that a run has written (--root)")
+        raise DzopError(f"{root}: found a folder that is not a store, needs one that a run has written (--root)")
     return Store(LocalStoreConfig(root=root), announce=print)
 
 
-def _ls(rows: list[Row], *, long: bool) -> None:
+def _print_entries(entries: list[EntryInfo], *, long: bool) -> None:
     print(f"{'state':<11}{'rows':>6}{'size':>10}{'age':>8}  path")
-    for row in rows:
-        age = "-" if row.age_h is None else f"{row.age_h:.0f} h" if row.age_h < 48 else f"{row.age_h / 24:.0f} d"
-        print(f"{row.state:<11}{row.rows:>6}{format_bytes(row.stored_bytes):>10}{age:>8}  {row.path}")
+    for entry in entries:
+        size, age = format_bytes(entry.stored_bytes), _format_age(entry.age_h)
+        print(f"{_state(entry):<11}{entry.rows:>6}{size:>10}{age:>8}  {entry.path}")
         if long:
-            print(f"{'':37}made from {json.dumps(row.made_from, sort_keys=True)}")
+            print(f"{'':37}made from {json.dumps(entry.made_from, sort_keys=True)}")
 
 
-def _du(rows: list[Row]) -> None:
-    sums: defaultdict[str, list[int]] = defaultdict(lambda: [0, 0])
-    for row in rows:
-        for folder in (row.path.rsplit("/", 1)[0], "total"):
-            sums[folder][0] += 1
-            sums[folder][1] += row.stored_bytes
-    for folder, (count, size) in sorted(sums.items(), key=lambda item: (item[0] == "total", item[0])):
-        print(f"{format_bytes(size):>10}{count:>7} entries  {folder}")
+def _format_age(hours: float | None) -> str:
+    if hours is None:
+        return "-"
+    return f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
+
+
+def _state(entry: EntryInfo) -> str:
+    return "complete" if entry.complete else "incomplete"
+
+
+def _print_sizes(entries: list[EntryInfo]) -> None:
+    counts: defaultdict[str, int] = defaultdict(int)
+    sizes: defaultdict[str, int] = defaultdict(int)
+    for entry in entries:
+        for folder in (entry.folder, "total"):
+            counts[folder] += 1
+            sizes[folder] += entry.stored_bytes
+    for folder in sorted(sizes, key=lambda folder: (folder == "total", folder)):
+        print(f"{format_bytes(sizes[folder]):>10}{counts[folder]:>7} entries  {folder}")
 
 
 def _verify(store: Store) -> None:
-    verdicts = verify(store)
-    for path, verdict in verdicts:
-        if verdict:
-            print(f"{path}: {verdict}")
-    bad = sum(bool(verdict) for _, verdict in verdicts)
-    print(f"{len(verdicts) - bad} entries whole, {bad} not")
+    """Print every problem. Raises DzopError if there is one, so that the command exits with 1."""
+    problems = verify(store)
+    for path, problem in problems.items():
+        if problem:
+            print(f"{path}: {problem}")
+    bad = sum(map(bool, problems.values()))
+    print(f"{len(problems) - bad} entries intact, {bad} damaged or incomplete")
     if bad:
-        raise DzopError(f"{bad} of {len(verdicts)} entries are not whole; they are computed again when they are needed")
+        found = f"{bad} of {len(problems)} entries are damaged or incomplete"
+        raise DzopError(f"{found}; the next run that needs them recomputes what is missing")
 
 
-def _gc(store: Store, older_than_days: float | None, *, dry_run: bool) -> None:
+def _collect_garbage(store: Store, older_than_days: float | None, *, dry_run: bool) -> None:
     hours = None if older_than_days is None else older_than_days * 24
-    doomed = collect(store, older_than_h=hours, dry_run=dry_run)
-    for row in doomed:
-        print(f"{'would remove' if dry_run else 'removed'} {row.path} ({format_bytes(row.stored_bytes)}, {row.state})")
-    print(f"{len(doomed)} entries, {format_bytes(sum(row.stored_bytes for row in doomed))}")
+    removed = collect_garbage(store, older_than_h=hours, dry_run=dry_run)
+    for entry in removed:
+        verb = "would remove" if dry_run else "removed"
+        print(f"{verb} {entry.path} ({format_bytes(entry.stored_bytes)}, {_state(entry)})")
+    print(f"{len(removed)} entries, {format_bytes(sum(entry.stored_bytes for entry in removed))}")

@@ -1,8 +1,10 @@
-"""Keys and the feature store: the only door to Zarr."""
+"""Cache keys and the feature store. Only this package imports Zarr."""
 
+from pipeline.store.arrays import Layout
 from pipeline.store.backends import LocalStoreConfig, MemoryStoreConfig, S3StoreConfig, StoreConfig
-from pipeline.store.entries import DamagedEntry, Entry, Layout, Store
+from pipeline.store.entry import DamagedEntry, Entry
 from pipeline.store.keys import Ref, make_ref
+from pipeline.store.store import Store
 
 __all__ = [
     "DamagedEntry",

@@ -1,4 +1,4 @@
-"""``dzop cache``: what is in a store, what it takes, whether it is whole, and how to make room."""
+"""Maintenance of a store, for ``dzop cache``: list entries, verify their bytes, remove some."""
 
 from __future__ import annotations
 
@@ -7,99 +7,108 @@ from datetime import UTC, datetime
 from typing import Any
 
 from pipeline.errors import BadInput
-from pipeline.store.completion import completeness
-from pipeline.store.entries import DamagedEntry, Store
+from pipeline.store.completion import completion_record
+from pipeline.store.entry import DamagedEntry
 from pipeline.store.keys import Ref, make_ref
+from pipeline.store.store import Store
 
 
 @dataclass(frozen=True)
-class Row:
-    """One entry as ``ls`` shows it. ``state``: complete or incomplete; ``age_h`` None when it never was complete."""
+class EntryInfo:
+    """One entry as ``dzop cache ls`` lists it. ``age_h``: hours since it was completed, None if it never was."""
 
     path: str
-    state: str
+    complete: bool
     rows: int
     stored_bytes: int
     age_h: float | None
     kind: str
     made_from: Any
 
+    @property
+    def folder(self) -> str:
+        """The path without the key."""
+        return self.path.rpartition("/")[0]
 
-def entries(store: Store) -> list[Row]:
-    """All entries by path."""
-    return [_row(store, path) for path in store.entry_paths()]
+    @property
+    def key(self) -> str:
+        """The entry's key."""
+        return self.path.rpartition("/")[2]
+
+    @property
+    def ref(self) -> Ref:
+        """Reference to read a complete entry by."""
+        return make_ref(self.folder, self.made_from["recipe"], self.made_from["inputs"])
 
 
-def _row(store: Store, path: str) -> Row:
+def list_entries(store: Store) -> list[EntryInfo]:
+    """All entries, sorted by path."""
+    return [_describe(store, path) for path in store.entry_paths()]
+
+
+def _describe(store: Store, path: str) -> EntryInfo:
     attributes = store.attributes(path) or {}
-    record = completeness(attributes, path.rsplit("/", 1)[-1])
+    record = completion_record(attributes, path.rpartition("/")[2])
     made_from = attributes.get("made_from")
     recipe = made_from.get("recipe") if isinstance(made_from, dict) else None
-    age = None
-    if record is not None:
-        seconds = (datetime.now(UTC) - datetime.fromisoformat(record["at"])).total_seconds()
-        age = max(0.0, seconds / 3600)  # a clock that was put back makes nothing old
-    return Row(
+    return EntryInfo(
         path=path,
-        state="incomplete" if record is None else "complete",
+        complete=record is not None,
         rows=0 if record is None else int(record["rows"]),
         stored_bytes=store.stored_bytes(path),
-        age_h=age,
+        age_h=None if record is None else _hours_since(record["at"]),
         kind=str(recipe.get("kind", "?")) if isinstance(recipe, dict) else "?",
         made_from=made_from,
     )
 
 
-def verify(store: Store) -> list[tuple[str, str]]:
-    """(path, verdict) of every entry: every byte of every array is read; "" means whole.
+def _hours_since(time: str) -> float:
+    seconds = (datetime.now(UTC) - datetime.fromisoformat(time)).total_seconds()
+    return max(0.0, seconds / 3600)  # the clock may have been set back since
 
-    A damaged entry is marked incomplete, so that the next run mends it.
+
+def verify(store: Store) -> dict[str, str]:
+    """Read every byte of every entry: path -> problem, "" for an intact entry.
+
+    A damaged entry is marked incomplete, so that the next run repairs it.
     """
-    verdicts = []
-    for row in entries(store):
-        if row.state != "complete":
-            verdicts.append((row.path, "incomplete: the next run that needs it completes it"))
-            continue
-        entry = store.read(_ref(row))
-        try:
-            for name in entry.record["arrays"]:
-                for index in range(entry.rows):
-                    entry.array(name, [index])
-        except DamagedEntry as damage:
-            verdicts.append((row.path, str(damage)))
-        else:
-            verdicts.append((row.path, ""))
-    return verdicts
+    return {entry.path: _find_problem(store, entry) for entry in list_entries(store)}
 
 
-def collect(store: Store, *, older_than_h: float | None, dry_run: bool) -> list[Row]:
-    """Entries removed (or that would be): incomplete ones, and those older than a number of hours if given.
+def _find_problem(store: Store, info: EntryInfo) -> str:
+    if not info.complete:
+        return "incomplete: the next run that needs it completes it"
+    try:
+        entry = store.read(info.ref)
+        for name in entry.arrays:
+            for row in range(entry.rows):
+                entry.array(name, [row])
+    except DamagedEntry as damage:
+        return str(damage)
+    return ""
 
-    An incomplete entry that another process is writing at this moment is left alone where the store has locks.
+
+def collect_garbage(store: Store, *, older_than_h: float | None, dry_run: bool) -> list[EntryInfo]:
+    """Remove incomplete entries, and complete ones older than ``older_than_h`` if given; returns them.
+
+    ``dry_run`` removes nothing. Where the store has locks, an entry that is being written is waited for and kept.
     """
-    doomed = [
-        row
-        for row in entries(store)
-        if row.state == "incomplete" or (older_than_h is not None and (row.age_h or 0.0) > older_than_h)
-    ]
-    for row in doomed if not dry_run else []:
-        with store.backend.lock(row.path.rsplit("/", 1)[-1], store.announce):
-            fresh = _row(store, row.path)
-            if fresh.state == row.state:
-                store.delete(row.path)
-    return doomed
+    garbage = [entry for entry in list_entries(store) if not entry.complete or _is_older(entry, older_than_h)]
+    for entry in [] if dry_run else garbage:
+        with store.backend.lock(entry.key, store.announce):
+            if _describe(store, entry.path).complete == entry.complete:  # not completed while we waited
+                store.delete(entry.path)
+    return garbage
 
 
-def find(store: Store, prefix: str) -> Row:
-    """The one entry whose key starts with ``prefix``. Raises BadInput for none or several."""
-    found = [path for path in store.entry_paths() if path.rsplit("/", 1)[-1].startswith(prefix)]
+def _is_older(entry: EntryInfo, hours: float | None) -> bool:
+    return hours is not None and (entry.age_h or 0.0) > hours
+
+
+def find_entry(store: Store, prefix: str) -> EntryInfo:
+    """The only entry whose key starts with ``prefix``. Raises BadInput for none or several."""
+    found = [path for path in store.entry_paths() if path.rpartition("/")[2].startswith(prefix)]
     if len(found) != 1:
-        raise BadInput(
-            "cache path", found=f"{len(found)} entries whose key starts with {prefix!r}", needed="exactly one"
-        )
-    return _row(store, found[0])
-
-
-def _ref(row: Row) -> Ref:
-    folder = row.path.rsplit("/", 1)[0]
-    return make_ref(folder, row.made_from["recipe"], row.made_from["inputs"])
+        found_text = f"{len(found)} entries whose key starts with {prefix!r}"
+        raise BadInput("cache path", found=found_text, needed="exactly one")
+    return _describe(store, found[0])

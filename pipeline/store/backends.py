@@ -1,4 +1,4 @@
-"""Places a store can be: local disk, memory, S3. One yaml each in conf/store."""
+"""Store backends: local disk, memory, S3. Each has a yaml in conf/store."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import errno
 import logging
 import threading
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 from filelock import FileLock, Timeout
 from zarr.abc.store import Store as ZarrStore
@@ -20,14 +20,18 @@ from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
 from pipeline.errors import BadInput, DzopError
 from pipeline.spec import PositiveFloat, Spec, spec
-from pipeline.store.remote import Answering, told
+from pipeline.store.remote import RemoteStore, translate_errors
 
 Announce = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Backend:
-    """An opened place: Zarr's store, where digests of large files may be remembered, and a lock per entry."""
+    """An open backend.
+
+    ``place``: its location, for messages. ``folder``: its folder on disk, None when it is not on this machine.
+    ``lock(name, announce)``: a context manager; ``announce`` is called with a message if it has to wait.
+    """
 
     zarr: ZarrStore
     place: str
@@ -36,70 +40,76 @@ class Backend:
 
 
 class StoreConfig(Protocol):
-    """What a store variant is: a place that can be opened. It enters no key."""
+    """A store variant. Never part of a key: the same entry may be stored anywhere."""
 
     def open(self) -> Backend:
-        """The opened place. Raises BadInput when it cannot be used."""
+        """Open the backend. Raises BadInput when it cannot be used."""
         ...
 
 
 @spec
 class LocalStoreConfig(Spec):
-    """A folder. Two processes that want the same entry: one computes, the other waits, then reads."""
+    """A folder. When two processes need the same entry, one computes it; the other waits, then reads it."""
 
     kind: ClassVar[str] = "store.local"
     root: str = "cache"
 
     def open(self) -> Backend:
-        """The folder, created when missing."""
+        """Open the folder, created if it is missing."""
         root = Path(self.root).expanduser().resolve()
         try:
             root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BadInput(
-                "store.root", found=f"{root} ({error.strerror})", needed="a folder that can be made"
-            ) from None
-        return Backend(_Folder(root), str(root), root, lambda key, say: _file_lock(root / ".locks", key, say))
+            found = f"{root} ({error.strerror})"
+            raise BadInput("store.root", found=found, needed="a folder that can be created") from None
+
+        def lock(key: str, announce: Announce) -> AbstractContextManager[None]:
+            return _lock_file(root / ".locks", key, announce)
+
+        return Backend(_LocalStore(root), str(root), root, lock)
 
 
-class _Folder(LocalStore):
-    """A LocalStore that leaves alone what is there: zarr writes the documents of all groups above a new one again."""
+class _LocalStore(LocalStore):
+    """LocalStore without needless writes: creating a group makes Zarr set the metadata of every group above it."""
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """As LocalStore.set_if_not_exists, without a file beside it where there is nothing to do."""
+        """As LocalStore.set_if_not_exists, which writes a temporary file even when the key exists."""
         if not await self.exists(key):
             await super().set_if_not_exists(key, value)
 
 
 @contextmanager
-def _file_lock(folder: Path, key: str, announce: Announce):
-    """Held until the block ends or the process dies: the kernel drops a dead process's lock."""
-    try:
+def _lock_file(folder: Path, key: str, announce: Announce) -> Iterator[None]:
+    """Hold a file lock. The kernel releases it when the process dies. Raises DzopError on a read-only disk."""
+    with _explain_read_only(folder.parent), ExitStack() as stack:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / f"{key}.lock")
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(lock.acquire(timeout=0.2))
-            except Timeout:
-                announce("another process computes this entry: waiting for it")
-                stack.enter_context(lock.acquire())
-            yield
-    except PermissionError as error:
-        raise DzopError(f"{folder.parent}: the store is read-only here ({error.strerror}); it lacks an entry") from None
+        try:
+            stack.enter_context(lock.acquire(timeout=0.2))
+        except Timeout:
+            announce("another process is computing this entry; waiting for it")
+            stack.enter_context(lock.acquire())
+        yield
+
+
+@contextmanager
+def _explain_read_only(root: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
-        if error.errno == errno.EROFS:
-            raise DzopError(f"{folder.parent}: the store is read-only here; it lacks an entry") from None
-        raise
+        if not isinstance(error, PermissionError) and error.errno != errno.EROFS:
+            raise
+        raise DzopError(f"{root}: the store is read-only here ({error.strerror}) and lacks an entry") from None
 
 
 @spec
 class MemoryStoreConfig(Spec):
-    """Nothing on disk; gone with the process. For tests and for a single image."""
+    """In memory: lost when the process ends. For tests and for a single image."""
 
     kind: ClassVar[str] = "store.memory"
 
     def open(self) -> Backend:
-        """An empty store."""
+        """Open an empty store."""
         locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
         @contextmanager
@@ -112,10 +122,10 @@ class MemoryStoreConfig(Spec):
 
 @spec
 class S3StoreConfig(Spec):
-    """Any S3-compatible bucket (``pip install dzop[s3]``), so that workers share one cache.
+    """An S3-compatible bucket (``pip install dzop[s3]``), so that several machines share one cache.
 
-    There is no lock: two workers that want the same entry both compute it and write the same bytes. ``timeout_s``:
-    how long a request may take; it is sent up to six times, with pauses, before the run ends.
+    There are no locks: two workers that need the same entry both compute it and write the same bytes. ``timeout_s``:
+    how long one request may take; it is sent up to six times, with pauses, before the run fails.
     """
 
     kind: ClassVar[str] = "store.s3"
@@ -125,10 +135,21 @@ class S3StoreConfig(Spec):
     timeout_s: PositiveFloat = 20.0
 
     def open(self) -> Backend:
-        """The bucket and prefix of ``url``. Raises BadInput, StoreUnreachable for one that cannot be listed."""
+        """Open the bucket. Raises BadInput for a malformed URL, StoreUnreachable if the bucket cannot be listed."""
         if not self.url.startswith("s3://") or not self.url.removeprefix("s3://").strip("/"):
             raise BadInput("store.url", found=repr(self.url), needed="s3://bucket/prefix")
-        options = {
+        logging.getLogger("aiobotocore.credentials").setLevel(logging.WARNING)  # it logs where it found credentials
+        try:
+            store = FsspecStore.from_url(self.url.rstrip("/"), storage_options=self._options())
+        except ImportError:
+            raise BadInput("store", found="s3 without s3fs", needed="pip install 'dzop[s3]'") from None
+        store.fs.retries = 2  # by s3fs, on top of the three attempts by botocore: six requests
+        sync(_check_bucket(store, self.url))
+        return Backend(RemoteStore(store, self.url), self.url, None, lambda key, announce: nullcontext())
+
+    def _options(self) -> dict[str, Any]:
+        """Options of s3fs."""
+        return {
             "anon": self.anonymous,
             "endpoint_url": self.endpoint_url,
             "config_kwargs": {
@@ -138,21 +159,13 @@ class S3StoreConfig(Spec):
             },
             "use_listings_cache": False,  # other workers write there too
         }
-        logging.getLogger("aiobotocore.credentials").setLevel(logging.WARNING)  # that it found them is no news
-        try:
-            store = FsspecStore.from_url(self.url.rstrip("/"), storage_options=options)
-        except ImportError:
-            raise BadInput("store", found="s3 without s3fs", needed="pip install 'dzop[s3]'") from None
-        store.fs.retries = 2  # each of three attempts
-        sync(_check_bucket(store, self.url))
-        return Backend(Answering(store, self.url), self.url, None, lambda key, say: nullcontext())
 
 
 async def _check_bucket(store: FsspecStore, url: str) -> None:
-    """Raise in one line, before any work, when the bucket is not there or not ours to list."""
+    """List one key, so that a missing or forbidden bucket is reported before any work."""
     bucket, _, prefix = store.path.partition("/")
-    with told(url):
+    with translate_errors(url):
         try:
             await store.fs._call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, MaxKeys=1)
-        except ValueError as error:  # botocore's word on an endpoint that is no URL
+        except ValueError as error:  # botocore: the endpoint is not a URL
             raise BadInput("store.endpoint_url", found=error, needed="a URL, http://host:port") from None

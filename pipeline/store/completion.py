@@ -1,4 +1,8 @@
-"""What makes an entry count: a record written last, sealed over all it vouches for."""
+"""Completion records: the attribute, written last, that turns a group of arrays into a usable entry.
+
+The record holds digests of the document and of every array's metadata, and a checksum (``seal`` on disk) over itself,
+the key and the recipe. An entry whose record is missing or inconsistent counts as incomplete.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +25,11 @@ def metadata_digest(array: zarr.Array) -> str:
 
 
 def identity(ref: Ref) -> dict[str, Any]:
-    """The attributes of an entry that is not complete yet: what it will be made from."""
+    """Attributes of an entry that is still being written: its key and what it is made from."""
     return {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
 
 
-def finished(
+def complete_attributes(
     ref: Ref,
     arrays: Mapping[str, zarr.Array],
     document: Any,
@@ -34,7 +38,7 @@ def finished(
     time_s: float,
     nbytes: int,
 ) -> dict[str, Any]:
-    """All attributes of a complete entry. Written last and at once, they make it count."""
+    """Attributes of a complete entry: its identity, document and completion record. Write them last, in one request."""
     record = {
         "rows": rows,
         "bytes": nbytes,
@@ -44,25 +48,26 @@ def finished(
         "document": digest(document),
     }
     known = identity(ref)
-    return known | {"document": document, "complete": record | {"seal": _seal(ref.key, known["made_from"], record)}}
+    seal = _checksum(ref.key, known["made_from"], record)
+    return known | {"document": document, "complete": record | {"seal": seal}}
 
 
-def _seal(key: str, made_from: Any, record: Mapping[str, Any]) -> str:
-    return digest([FORMAT, key, made_from, dict(record)])
-
-
-def completeness(attributes: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
-    """An entry's record of completeness from its attributes, None unless every part of it holds together."""
+def completion_record(attributes: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
+    """The completion record among an entry's attributes; None unless every digest and the checksum match."""
     try:
         record = dict(attributes["complete"])
         seal = record.pop("seal")
-        whole = (
+        intact = (
             attributes["key"] == key
             and attributes["format"] == FORMAT
-            and seal == _seal(key, attributes["made_from"], record)
+            and seal == _checksum(key, attributes["made_from"], record)
             and digest(attributes["document"]) == record["document"]
             and digest(attributes["made_from"]) == key
         )
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
-    return record if whole else None
+    return record if intact else None
+
+
+def _checksum(key: str, made_from: Any, record: Mapping[str, Any]) -> str:
+    return digest([FORMAT, key, made_from, dict(record)])

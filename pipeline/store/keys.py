@@ -1,4 +1,4 @@
-"""Identity: key = sha256 of the canonical JSON of (recipe, input keys), a Merkle tree from mesh bytes to poses."""
+"""Cache keys: sha256 of the canonical JSON of (recipe, input keys), a Merkle tree from mesh files to poses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.spec import canonical, digest
 
 @dataclass(frozen=True)
 class Ref:
-    """Where an entry lies and what it is made from. ``made_from`` is the hashed text; it is stored with the entry."""
+    """Path of an entry, and the hashed text of what it is made from, which is stored with the entry."""
 
     folder: str
     key: str
@@ -19,11 +19,11 @@ class Ref:
 
     @property
     def path(self) -> str:
-        """``<folder>/<key>``, below the store's root."""
+        """``<folder>/<key>``, relative to the store's root."""
         return f"{self.folder}/{self.key}"
 
 
 def make_ref(folder: str, recipe: Mapping[str, Any], inputs: Mapping[str, str]) -> Ref:
-    """The entry of ``recipe`` applied to ``inputs`` (name -> key or file digest), below ``folder``."""
+    """The entry below ``folder`` for ``recipe`` applied to ``inputs`` (name -> key or file digest)."""
     made_from = {"recipe": dict(recipe), "inputs": dict(inputs)}
     return Ref(folder, digest(made_from), canonical(made_from))

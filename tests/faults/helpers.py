@@ -1,4 +1,4 @@
-"""The small run that faults are injected into: its command in a process of its own, and its results as bytes."""
+"""A small run to inject faults into: its command in a separate process, and its results as comparable bytes."""
 
 import csv
 import json
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.spec import canonical
-from pipeline.store import LocalStoreConfig, Store, make_ref
-from pipeline.store.admin import entries
+from pipeline.store import LocalStoreConfig, Store
+from pipeline.store.admin import list_entries
 
 STEPS = ("onboard", "detect", "estimate", "evaluate")
 SMALL = (
@@ -41,27 +41,27 @@ class Ended:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """Where the dataset and the detector's weights lie."""
+class Inputs:
+    """Folders of the dataset and of the detector's weights, and the command that uses them."""
 
     scene: Path
     sam: Path
 
     def start(self, folder: Path, step: str, *more: str, name: str = "run") -> BaseProcess:
-        """``dzop step=...`` with its store and results below ``folder``; prints to ``folder/name.out`` and ``.err``.
+        """Start ``dzop step=...`` with store and results below ``folder``; prints to ``folder/name.out`` and ``.err``.
 
-        ``detect`` is by a detector with random weights; poses are of true masks, so that there are some.
+        ``detect`` uses a detector with random weights. Poses are estimated from true masks, so that there are any.
         """
         cnos = (*CNOS, f"detect.proposals.weights={self.sam}") if step == "detect" else ()
         arguments = [*SMALL, *cnos, f"dataset.root={self.scene}", f"step={step}", *more]
-        context = multiprocessing.get_context("forkserver")  # imports are done once; a process is there in no time
+        context = multiprocessing.get_context("forkserver")  # imports once, so that processes start quickly
         context.set_forkserver_preload(LOADED)
         process = context.Process(target=_command, args=(str(folder), arguments, name))
         process.start()
         return process
 
     def run(self, folder: Path, step: str = "evaluate", *more: str, name: str = "run") -> Ended:
-        """The same to its end. A traceback is a fault of ours whatever was injected."""
+        """Start the command and wait for it. A traceback is a bug, whatever fault was injected."""
         return self.end(self.start(folder, step, *more, name=name), folder, name=name)
 
     def end(self, process: BaseProcess, folder: Path, *, name: str = "run") -> Ended:
@@ -84,10 +84,10 @@ def _command(folder: str, arguments: list[str], name: str) -> None:
 
 
 @dataclass(frozen=True)
-class Undisturbed:
-    """What the steps leave when nothing goes wrong: the folder after each of them, and how long they took.
+class Reference:
+    """Results of an undisturbed run: the folder after each step, and the seconds each step took.
 
-    ``alone``: the folder of a single ``step=evaluate``.
+    ``alone``: the folder of a single ``step=evaluate`` on an empty cache.
     """
 
     after: dict[str, Path]
@@ -99,7 +99,7 @@ class Undisturbed:
         return self.after[STEPS[at - 1]] if at else None
 
     def copy(self, folder: Path, source: Path | None) -> Path:
-        """A folder of its own with what ``source`` has."""
+        """Copy ``source`` to ``folder``; an empty folder for None."""
         if source is None:
             folder.mkdir()
             return folder
@@ -107,17 +107,17 @@ class Undisturbed:
         return folder
 
 
-def undisturbed(ground: Ground, folder: Path) -> Undisturbed:
-    """Every step after the one before."""
+def run_reference(inputs: Inputs, folder: Path) -> Reference:
+    """Run every step on the results of the one before."""
     after: dict[str, Path] = {}
     seconds: dict[str, float] = {}
     (folder / "first").mkdir()
-    ground.run(folder / "first", "onboard", "plan=true")  # imports are no part of a step's time
+    inputs.run(folder / "first", "onboard", "plan=true")  # warms up imports, which are not part of a step's time
     for step in STEPS:
         run = folder / step
         run.mkdir() if not after else shutil.copytree(list(after.values())[-1], run)
         start = time.monotonic()
-        ended = ground.run(run, step)
+        ended = inputs.run(run, step)
         seconds[step] = time.monotonic() - start
         assert ended.status == 0, ended.err
         after[step] = run
@@ -126,9 +126,9 @@ def undisturbed(ground: Ground, folder: Path) -> Undisturbed:
     poses = json.loads(next((after["evaluate"] / "results").glob("*/*/poses.json")).read_text())["answers"]
     assert [answer["status"] for answer in poses] == ["estimate"] * 4
     (folder / "alone").mkdir()
-    assert ground.run(folder / "alone").status == 0
+    assert inputs.run(folder / "alone").status == 0
     assert stored(folder / "alone").items() <= whole.items()
-    return Undisturbed(after, seconds, folder / "alone")
+    return Reference(after, seconds, folder / "alone")
 
 
 def store_of(folder: Path) -> Store:
@@ -136,27 +136,27 @@ def store_of(folder: Path) -> Store:
 
 
 def stored(folder: Path) -> dict[str, bytes]:
-    """Every array and document of the store's complete entries; seconds that were measured are left out.
+    """Every array and document of the store's complete entries, without measured seconds.
 
-    Raises DamagedEntry for an entry that counts as complete and is not.
+    Raises DamagedEntry for an entry that is recorded as complete but is damaged.
     """
     store, found = store_of(folder), {}
-    for row in entries(store):
-        if row.state == "complete":
-            entry = store.read(make_ref(row.path.rsplit("/", 1)[0], row.made_from["recipe"], row.made_from["inputs"]))
-            found |= {f"{row.path}/{name}": entry.array(name).tobytes() for name in entry.record["arrays"]}
-            found[row.path] = canonical(without_seconds(entry.document)).encode()
+    for info in list_entries(store):
+        if info.complete:
+            entry = store.read(info.ref)
+            found |= {f"{info.path}/{name}": entry.array(name).tobytes() for name in entry.arrays}
+            found[info.path] = canonical(remove_times(entry.document)).encode()
     return found
 
 
-def without_seconds(value: Any) -> Any:
+def remove_times(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: without_seconds(item) for name, item in value.items() if name not in MEASURED}
-    return [without_seconds(item) for item in value] if isinstance(value, list) else value
+        return {name: remove_times(item) for name, item in value.items() if name not in MEASURED}
+    return [remove_times(item) for item in value] if isinstance(value, list) else value
 
 
 def written(folder: Path, out: str = "results") -> dict[str, Any]:
-    """The files of the results, times left out; each must be whole."""
+    """The results files without measured seconds; none may be truncated."""
     found: dict[str, Any] = {}
     for path in sorted((folder / out).rglob("*")):
         name = path.relative_to(folder / out).as_posix()
@@ -164,8 +164,8 @@ def written(folder: Path, out: str = "results") -> dict[str, Any]:
             found[name] = [row[:-1] for row in csv.reader(path.read_text().splitlines())]
         elif path.suffix == ".json":
             content = json.loads(path.read_text())
-            found[name] = without_seconds(content["answers"]) if path.name == "poses.json" else path.name
+            found[name] = remove_times(content["answers"]) if path.name == "poses.json" else path.name
         elif path.suffix == ".jpg":
-            assert path.read_bytes().endswith(b"\xff\xd9"), f"{name} is cut"
+            assert path.read_bytes().endswith(b"\xff\xd9"), f"{name} is truncated"
             found[name] = path.read_bytes()
     return found

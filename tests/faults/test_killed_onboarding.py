@@ -1,4 +1,4 @@
-"""Onboarding killed at random moments, then run to its end, leaves the bytes of a run that nobody disturbed."""
+"""Onboarding that was killed at random moments and then completed writes the same bytes as an undisturbed run."""
 
 import os
 import random
@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.store import LocalStoreConfig, Store, make_ref
-from pipeline.store.admin import entries
+from pipeline.store import LocalStoreConfig, Store
+from pipeline.store.admin import list_entries
 from pipeline.synthetic.scenes import write_dataset
 
 KILLS = 10
@@ -34,10 +34,10 @@ def onboard(cache: Path, scene: Path) -> subprocess.Popen:
 
 def arrays(cache: Path) -> dict[str, np.ndarray]:
     store, found = Store(LocalStoreConfig(root=str(cache))), {}
-    for row in entries(store):
-        assert row.state == "complete"
-        entry = store.read(make_ref(row.path.rsplit("/", 1)[0], row.made_from["recipe"], row.made_from["inputs"]))
-        found |= {f"{row.path}/{name}": entry.array(name) for name in entry.record["arrays"]}
+    for info in list_entries(store):
+        assert info.complete
+        entry = store.read(info.ref)
+        found |= {f"{info.path}/{name}": entry.array(name) for name in entry.arrays}
     return found
 
 
@@ -47,11 +47,11 @@ def chunks(cache: Path) -> int:
 
 @pytest.mark.faults
 def test_ten_kills_at_random_moments_change_no_byte(tmp_path):
-    scene, quiet, disturbed = tmp_path / "scene", tmp_path / "quiet", tmp_path / "disturbed"
+    scene, reference, disturbed = tmp_path / "scene", tmp_path / "reference", tmp_path / "disturbed"
     write_dataset(scene, objects=1, images=1, seed=2, size_hw=(120, 160), per_image=1, progress=False)
     start = time.monotonic()
-    assert onboard(quiet, scene).wait(300) == 0
-    whole, rng = chunks(quiet), random.Random(7)
+    assert onboard(reference, scene).wait(300) == 0
+    whole, rng = chunks(reference), random.Random(7)
     moments = sorted(rng.randrange(1, whole) for _ in range(KILLS))
     for moment in moments:
         process = onboard(disturbed, scene)
@@ -64,7 +64,7 @@ def test_ten_kills_at_random_moments_change_no_byte(tmp_path):
     last = onboard(disturbed, scene)
     printed, _ = last.communicate(timeout=300)
     assert last.returncode == 0, printed
-    ours, theirs = arrays(quiet), arrays(disturbed)
+    ours, theirs = arrays(reference), arrays(disturbed)
     assert len(ours) == 3 + 3 + 4  # templates: rgb, depth, pose; crops: rgb, mask, affine; features: four layers
     assert set(ours) == set(theirs)
     for name, values in ours.items():

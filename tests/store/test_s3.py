@@ -1,4 +1,4 @@
-"""A store on S3: faults of its server and of its bytes in one line, and two writers who know nothing of each other."""
+"""A store on S3: server faults and damaged chunks are reported in one line; two writers may write one entry."""
 
 import multiprocessing
 import socket
@@ -13,43 +13,43 @@ import pytest
 from pipeline.errors import BadInput
 from pipeline.store import DamagedEntry, S3StoreConfig, Store
 from pipeline.store.remote import StoreUnreachable
-from tests.store.test_entries import LAYOUT, REF, ROWS, compute, fill, values
+from tests.store.test_store import LAYOUT, REF, ROWS, compute, fill, values
 
 CHUNK = f"cache/{REF.path}/maps/c/3/0/0"
 
 
-def test_a_flipped_byte_and_a_missing_chunk_are_found_and_mended(s3):
+def test_a_flipped_byte_and_a_missing_chunk_are_detected_and_repaired(s3):
     store = Store(s3.config())
     fill(store)
-    whole = s3.get(CHUNK)
-    for broken in (bytes([whole[0] ^ 1]) + whole[1:], whole[:-3], None):
-        s3.delete(CHUNK) if broken is None else s3.put(CHUNK, broken)
-        with pytest.raises(DamagedEntry, match="run again, and only what is broken is computed again"):
+    intact = s3.get(CHUNK)
+    for damaged in (bytes([intact[0] ^ 1]) + intact[1:], intact[:-3], None):
+        s3.delete(CHUNK) if damaged is None else s3.put(CHUNK, damaged)
+        with pytest.raises(DamagedEntry, match="run again to recompute only what is damaged"):
             store.read(REF).array("maps")
         log: list[list[int]] = []
         fill(store, log)
         assert log == [[0, 1, 2, 3]]
-        assert s3.get(CHUNK) == whole
+        assert s3.get(CHUNK) == intact
         np.testing.assert_array_equal(store.read(REF).array("maps"), values(list(range(ROWS))))
 
 
-def test_a_bucket_that_is_not_there_is_told_in_one_line(s3):
+def test_a_missing_bucket_is_reported_in_one_line(s3):
     with pytest.raises(StoreUnreachable, match="s3://no-such-bucket/cache: the bucket does not exist"):
         Store(s3.config(url="s3://no-such-bucket/cache"))
 
 
 @pytest.mark.parametrize("url", ["bucket/cache", "s3://", "s3:///"])
-def test_a_url_without_a_bucket_is_told_in_one_line(url):
+def test_a_url_without_a_bucket_is_reported_in_one_line(url):
     with pytest.raises(BadInput, match=r"store.url: found .*, needs s3://bucket/prefix"):
         S3StoreConfig(url=url).open()
 
 
-def test_an_endpoint_that_is_no_url_is_told_in_one_line(s3):
+def test_a_malformed_endpoint_is_reported_in_one_line(s3):
     with pytest.raises(BadInput, match=r"store.endpoint_url: found .*, needs a URL"):
         Store(s3.config(endpoint_url="somewhere"))
 
 
-def test_missing_credentials_are_told_in_one_line(s3, monkeypatch):
+def test_missing_credentials_are_reported_in_one_line(s3, monkeypatch):
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
@@ -57,23 +57,23 @@ def test_missing_credentials_are_told_in_one_line(s3, monkeypatch):
         Store(s3.config(timeout_s=7.0))
 
 
-def test_nobody_at_the_other_end_is_told_in_one_line():
+def test_a_refused_connection_is_reported_in_one_line():
     pytest.importorskip("s3fs", reason="needs s3fs: pip install 'dzop[s3]'")
-    with pytest.raises(StoreUnreachable, match="run again when it answers: what is complete is kept"):
+    with pytest.raises(StoreUnreachable, match="run again when it answers: completed entries are kept"):
         Store(S3StoreConfig(url="s3://bucket/cache", endpoint_url="http://127.0.0.1:1", anonymous=True))
 
 
-def test_a_server_that_never_answers_is_given_up(s3):
-    with socket.socket() as deaf:
-        deaf.bind(("127.0.0.1", 0))
-        deaf.listen(64)
-        url = f"http://127.0.0.1:{deaf.getsockname()[1]}"
+def test_a_server_that_never_answers_times_out(s3):
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen(64)
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(StoreUnreachable, match=r"timeout|no answer within"):
             Store(s3.config(endpoint_url=url, timeout_s=0.05))
 
 
 class Faulty(BaseHTTPRequestHandler):
-    """Passes requests on to the server, but for those that its server's ``faults`` say no to."""
+    """A proxy that fails the requests selected by ``server.faults`` and forwards the others."""
 
     protocol_version = "HTTP/1.1"
 
@@ -85,7 +85,7 @@ class Faulty(BaseHTTPRequestHandler):
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         if self.server.faults(self.command, self.path):
             self._answer(
-                self.server.status, b"<Error><Code>InternalError</Code><Message>We are ill</Message></Error>", {}
+                self.server.status, b"<Error><Code>InternalError</Code><Message>injected</Message></Error>", {}
             )
             return
         there = http.client.HTTPConnection(self.server.behind)
@@ -122,7 +122,7 @@ def faulty(s3) -> Iterator[ThreadingHTTPServer]:
 
 
 @pytest.mark.parametrize("status", [500, 503, 403])
-def test_a_server_that_fails_in_the_middle_of_an_entry_leaves_it_incomplete_and_the_next_run_heals_it(s3, status):
+def test_a_server_fault_leaves_the_entry_incomplete_and_the_next_run_completes_it(s3, status):
     with faulty(s3) as server:
         store = Store(s3.config(endpoint_url=f"http://127.0.0.1:{server.server_address[1]}"))
         server.status, written = status, []
@@ -135,20 +135,20 @@ def test_a_server_that_fails_in_the_middle_of_an_entry_leaves_it_incomplete_and_
         with pytest.raises(StoreUnreachable) as fault:
             store.fill({REF: LAYOUT}, rows=ROWS, batch=1, compute=compute)
         assert len(str(fault.value).splitlines()) == 1
-    healed = Store(s3.config())
-    assert healed.state(REF) == "partial"
-    assert healed.fill({REF: LAYOUT}, rows=ROWS, batch=1, compute=compute).reused == 5
-    np.testing.assert_array_equal(healed.read(REF).array("maps"), values(list(range(ROWS))))
+    resumed = Store(s3.config())
+    assert resumed.state(REF) == "partial"
+    assert resumed.fill({REF: LAYOUT}, rows=ROWS, batch=1, compute=compute).reused == 5
+    np.testing.assert_array_equal(resumed.read(REF).array("maps"), values(list(range(ROWS))))
 
 
-def test_a_fault_while_reading_is_no_missing_entry(s3):
+def test_a_fault_while_reading_is_not_taken_for_a_missing_entry(s3):
     fill(Store(s3.config()))
     with faulty(s3) as server:
         store = Store(s3.config(endpoint_url=f"http://127.0.0.1:{server.server_address[1]}"))
         server.faults = lambda command, path: True
-        for look in (lambda: store.is_complete(REF), lambda: store.read(REF)):
+        for request in (lambda: store.is_complete(REF), lambda: store.read(REF)):
             with pytest.raises(StoreUnreachable):
-                look()
+                request()
         server.faults = lambda command, path: "/maps/c/" in path
         with pytest.raises(StoreUnreachable):
             store.read(REF).array("maps")

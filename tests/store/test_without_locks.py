@@ -1,4 +1,4 @@
-"""Two writers of one entry where nothing keeps them apart, as on S3: each ends with a whole entry."""
+"""Two writers of one entry without locks, as on S3: whatever the interleaving, both end with a complete entry."""
 
 import asyncio
 from collections.abc import Callable
@@ -11,13 +11,13 @@ from zarr.storage import MemoryStore, WrapperStore
 from pipeline.store import Store
 from pipeline.store.backends import Backend
 from pipeline.store.keys import Ref
-from tests.store.test_entries import LAYOUT, REF, compute, values
+from tests.store.test_store import LAYOUT, REF, compute, values
 
 DOCUMENT = Ref("documents", REF.key, REF.made_from)
 
 
 class Interrupted(WrapperStore[MemoryStore]):
-    """Something else happens before its n-th request."""
+    """Calls ``happen`` before its n-th request."""
 
     def __init__(self, store: MemoryStore, before: int = -1, happen: Callable[[], None] = lambda: None) -> None:
         super().__init__(store)
@@ -65,16 +65,16 @@ def write_and_read(store: Store) -> None:
     assert store.read(DOCUMENT).document == {"a": 1}
 
 
-def test_a_writer_that_another_overtakes_at_any_request_ends_with_a_whole_entry():
-    quiet = Place()
-    write_and_read(Store(quiet))
-    assert quiet.zarr.requests > 20
+def test_a_writer_overtaken_at_any_request_ends_with_a_complete_entry():
+    undisturbed = Place()
+    write_and_read(Store(undisturbed))
+    assert undisturbed.zarr.requests > 20
     overtaken = 0
-    for before in range(quiet.zarr.requests):
+    for before in range(undisturbed.zarr.requests):
         shared = MemoryStore()
         other = Store(Place(Interrupted(shared)))
         ours = Interrupted(shared, before, lambda other=other: write_and_read(other))
         write_and_read(Store(Place(ours)))
         write_and_read(other)
         overtaken += ours.requests > before
-    assert overtaken == quiet.zarr.requests
+    assert overtaken == undisturbed.zarr.requests

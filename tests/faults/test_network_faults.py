@@ -1,4 +1,4 @@
-"""A store at the other end of a network that fails, times out or refuses in the middle of whatever it is asked."""
+"""A remote store that fails, times out or refuses access at any request."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +9,8 @@ from zarr.storage import LocalStore, WrapperStore
 
 from pipeline.errors import DzopError
 from pipeline.store import Layout, LocalStoreConfig, Store, make_ref
-from pipeline.store.admin import entries, verify
-from pipeline.store.remote import Answering, StoreUnreachable
+from pipeline.store.admin import list_entries, verify
+from pipeline.store.remote import RemoteStore, StoreUnreachable
 
 REF = make_ref("features/toy", {"kind": "toy", "version": 1}, {})
 DOCUMENT = make_ref("runs", {"kind": "toy run", "version": 1}, {})
@@ -19,7 +19,7 @@ VALUES = np.arange(5 * 6, dtype=np.float16).reshape(5, 2, 3)
 
 
 class ConnectTimeoutError(Exception):
-    """As botocore's: neither an OSError nor a RuntimeError."""
+    """Like botocore's: neither an OSError nor a RuntimeError."""
 
 
 FAULTS = {
@@ -34,7 +34,7 @@ FAULTS = {
 
 
 class Failing(WrapperStore):
-    """A store whose n-th request fails; with ``lasting`` all that follow do too."""
+    """A store whose n-th request fails; if ``lasting``, so do all later ones."""
 
     def __init__(self, store, fault: Exception | None = None, at: int = -1, *, lasting: bool = False) -> None:
         super().__init__(store)
@@ -68,31 +68,30 @@ class Failing(WrapperStore):
 
 def opened(root: Path, failing: Failing) -> Store:
     store = Store(LocalStoreConfig(root=str(root)))
-    store.backend = replace(store.backend, zarr=Answering(failing, "s3://bucket/prefix"))
+    store.backend = replace(store.backend, zarr=RemoteStore(failing, "s3://bucket/prefix"))
     return store
 
 
 def work(store: Store) -> tuple[bytes, object]:
-    """A step in small: what is missing is made, then everything is read."""
-    made = lambda rows: {REF.key: {"maps": VALUES[rows]}}  # noqa: E731
-    store.fill({REF: LAYOUT}, rows=5, batch=2, compute=made)
+    """A miniature step: fill what is missing, then read everything."""
+    store.fill({REF: LAYOUT}, rows=5, batch=2, compute=lambda rows: {REF.key: {"maps": VALUES[rows]}})
     if not store.is_complete(DOCUMENT):
         store.put_document(DOCUMENT, {"answers": [1, 2.5]}, rows=2)
     return store.read(REF).array("maps").tobytes(), store.read(DOCUMENT).document
 
 
-WHOLE = VALUES.tobytes(), {"answers": [1, 2.5]}
+EXPECTED = VALUES.tobytes(), {"answers": [1, 2.5]}
 
 
 @pytest.mark.parametrize(
     ("name", "every"), [("botocore", 5), *(pytest.param(name, 1, marks=pytest.mark.faults) for name in FAULTS)]
 )
 @pytest.mark.parametrize("lasting", [False, True])
-def test_whatever_request_fails_it_is_told_and_the_next_run_heals_it(
+def test_a_failure_of_any_request_is_reported_and_the_next_run_recovers(
     tmp_path: Path, name, every, lasting, record_property
 ):
     counting = Failing(LocalStore(tmp_path / "counting"))
-    assert work(opened(tmp_path / "counting", counting)) == WHOLE
+    assert work(opened(tmp_path / "counting", counting)) == EXPECTED
     requests = counting.asked
     assert requests > 20
     for at in range(1, requests + 1, every):
@@ -100,36 +99,36 @@ def test_whatever_request_fails_it_is_told_and_the_next_run_heals_it(
         store = opened(root, Failing(LocalStore(root), FAULTS[name], at, lasting=lasting))
         with pytest.raises(
             StoreUnreachable,
-            match=r"s3://bucket/prefix: (the store does not answer|access denied) .*: what is complete is kept",
+            match=r"s3://bucket/prefix: (the store does not answer|access denied) .*: completed entries are kept",
         ):
             work(store)
         healthy = Store(LocalStoreConfig(root=str(root)))
-        for row in entries(healthy):
-            assert row.state == "incomplete" or row.rows in (2, 5)
-        assert work(healthy) == WHOLE
-        assert all(not verdict for _, verdict in verify(healthy))
-    told = f"{len(range(1, requests + 1, every))} requests, each failed once"
-    record_property("told", f"{name}, {'lasting' if lasting else 'passing'}: {told}, told and healed")
+        for entry in list_entries(healthy):
+            assert not entry.complete or entry.rows in (2, 5)
+        assert work(healthy) == EXPECTED
+        assert not any(verify(healthy).values())
+    failed = f"{len(range(1, requests + 1, every))} requests, each failed once"
+    record_property("told", f"{name}, {'lasting' if lasting else 'transient'}: {failed}, reported and recovered")
 
 
-def told_silent(store: Store) -> bool:
-    """Whether the work ended with the store's silence; otherwise its results are whole."""
+def times_out(store: Store) -> bool:
+    """Whether the work ended with a timeout of the store; otherwise its results are as expected."""
     try:
-        assert work(store) == WHOLE
+        assert work(store) == EXPECTED
     except DzopError as error:
         return "does not answer" in str(error)
     return False
 
 
-def test_silence_in_the_middle_of_reading_deletes_nothing(tmp_path: Path):
-    """An entry that cannot be reached is neither missing nor damaged."""
-    assert work(Store(LocalStoreConfig(root=str(tmp_path)))) == WHOLE
+def test_a_timeout_while_reading_deletes_nothing(tmp_path: Path):
+    """An unreachable entry is neither missing nor damaged."""
+    assert work(Store(LocalStoreConfig(root=str(tmp_path)))) == EXPECTED
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     at = 0
     while True:
         at += 1
         failing = Failing(LocalStore(tmp_path), FAULTS["timeout"], at, lasting=True)
-        if not told_silent(opened(tmp_path, failing)):
+        if not times_out(opened(tmp_path, failing)):
             break
         assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     assert at > 5

@@ -1,4 +1,4 @@
-"""One contract for every place a store can be, and the faults that only a disk can have."""
+"""One contract for all backends, and the faults that only a local disk can have."""
 
 import json
 import multiprocessing
@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.errors import BadInput
 from pipeline.store import DamagedEntry, Layout, LocalStoreConfig, MemoryStoreConfig, Store, make_ref
-from pipeline.store.admin import collect, entries, find, verify
+from pipeline.store.admin import collect_garbage, find_entry, list_entries, verify
 
 REF = make_ref("features/toy/t0/layer2", {"kind": "toy", "version": 1, "dim": 4}, {"crops": "a" * 64})
 OTHER = make_ref("features/toy/t0/layer5", {"kind": "toy", "version": 1, "dim": 8}, {"crops": "a" * 64})
@@ -50,7 +50,7 @@ def entry_folder(store: Store) -> Path:
     return Path(store.place) / REF.path
 
 
-def test_what_was_filled_is_read_back_row_by_row_and_whole(store: Store):
+def test_filled_values_are_read_back_by_row_and_all_at_once(store: Store):
     filled = fill(store)
     assert (filled.computed, filled.reused) == (ROWS, 0)
     entry = store.read(REF)
@@ -59,7 +59,7 @@ def test_what_was_filled_is_read_back_row_by_row_and_whole(store: Store):
     assert (entry.rows, store.size(REF), store.state(REF)) == (ROWS, ROWS * 12 * 2, "cached")
 
 
-def test_a_full_entry_is_not_computed_again(store: Store):
+def test_a_complete_entry_is_not_computed_again(store: Store):
     fill(store)
     log: list[list[int]] = []
     assert fill(store, log).reused == ROWS
@@ -91,7 +91,7 @@ def test_entries_that_share_rows_are_filled_in_one_pass(store: Store):
     assert store.is_complete(OTHER)
 
 
-def test_a_layer_that_is_there_is_left_alone_when_another_is_added(store: Store):
+def test_a_complete_layer_is_untouched_when_another_is_added(store: Store):
     fill(store)
     before = store.attributes(REF.path)
     fill(store, refs=(REF, OTHER))
@@ -99,27 +99,27 @@ def test_a_layer_that_is_there_is_left_alone_when_another_is_added(store: Store)
     assert store.is_complete(OTHER)
 
 
-def test_a_row_of_zeros_is_a_row_like_any_other(store: Store):
+def test_a_row_of_zeros_is_stored(store: Store):
     store.fill(
         {REF: LAYOUT}, rows=2, batch=2, compute=lambda rows: {REF.key: {"maps": np.zeros((2, 3, 4), np.float16)}}
     )
     np.testing.assert_array_equal(store.read(REF).array("maps"), np.zeros((2, 3, 4)))
 
 
-def test_documents_come_back_as_they_were_put(store: Store):
+def test_documents_are_read_back_unchanged(store: Store):
     store.put_document(REF, {"answers": [1, 1.5, "ü", None]}, rows=4)
     assert store.read(REF).document == {"answers": [1, 1.5, "ü", None]}
 
 
-def test_an_entry_says_what_it_was_made_from(store: Store):
+def test_an_entry_records_what_it_was_made_from(store: Store):
     fill(store)
     assert store.attributes(REF.path)["made_from"] == json.loads(REF.made_from)
-    assert find(store, REF.key[:8]).path == REF.path
+    assert find_entry(store, REF.key[:8]).path == REF.path
     with pytest.raises(BadInput, match="0 entries whose key starts with 'zz'"):
-        find(store, "zz")
+        find_entry(store, "zz")
 
 
-def test_another_layout_under_the_same_key_starts_anew(store: Store):
+def test_a_changed_layout_under_the_same_key_starts_from_scratch(store: Store):
     def other(rows: list[int]) -> dict:
         if rows[0] == 3:
             raise RuntimeError("interrupted")
@@ -131,13 +131,13 @@ def test_another_layout_under_the_same_key_starts_anew(store: Store):
 
 
 @pytest.mark.parametrize("position", [0, 11, -1])
-def test_a_flipped_byte_in_a_chunk_is_found_and_mended(local: Store, position: int):
+def test_a_flipped_byte_in_a_chunk_is_detected_and_repaired(local: Store, position: int):
     fill(local)
     chunk = entry_folder(local) / "maps" / "c" / "3" / "0" / "0"
     damaged = bytearray(chunk.read_bytes())
     damaged[position] ^= 1
     chunk.write_bytes(damaged)
-    with pytest.raises(DamagedEntry, match="run again, and only what is broken is computed again"):
+    with pytest.raises(DamagedEntry, match="run again to recompute only what is damaged"):
         local.read(REF).array("maps")
     assert local.state(REF) == "partial"
     log: list[list[int]] = []
@@ -147,7 +147,7 @@ def test_a_flipped_byte_in_a_chunk_is_found_and_mended(local: Store, position: i
 
 
 @pytest.mark.parametrize("keep", [0, 5])
-def test_a_truncated_chunk_is_found(local: Store, keep: int):
+def test_a_truncated_chunk_is_detected(local: Store, keep: int):
     fill(local)
     chunk = entry_folder(local) / "maps" / "c" / "9" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:keep])
@@ -164,18 +164,18 @@ def test_a_missing_chunk_never_reads_as_zeros(local: Store):
     np.testing.assert_array_equal(local.read(REF).array("maps", [5]), values([5]))
 
 
-def test_changed_metadata_is_found(local: Store):
+def test_changed_metadata_is_detected(local: Store):
     fill(local)
     meta = entry_folder(local) / "maps" / "zarr.json"
     meta.write_text(meta.read_text().replace('"float16"', '"int16"'))
-    with pytest.raises(DamagedEntry, match="other metadata"):
+    with pytest.raises(DamagedEntry, match="metadata of array maps changed"):
         local.read(REF).array("maps")
     fill(local)
     np.testing.assert_array_equal(local.read(REF).array("maps"), values(list(range(ROWS))))
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"node_type": "group"}'])
-def test_a_broken_record_makes_the_entry_a_miss(local: Store, text: str):
+def test_damaged_attributes_make_the_entry_a_miss(local: Store, text: str):
     fill(local)
     (entry_folder(local) / "zarr.json").write_text(text)
     assert not local.is_complete(REF)
@@ -190,18 +190,18 @@ def test_a_changed_document_makes_the_entry_a_miss(local: Store):
     assert not local.is_complete(REF)
 
 
-def test_verify_reads_every_byte_and_gc_removes_only_what_is_incomplete(local: Store):
+def test_verify_reads_every_byte_and_gc_removes_only_incomplete_entries(local: Store):
     fill(local, refs=(REF, OTHER))
-    assert verify(local) == [(REF.path, ""), (OTHER.path, "")]
+    assert verify(local) == {REF.path: "", OTHER.path: ""}
     chunk = entry_folder(local) / "maps" / "c" / "1" / "0" / "0"
     chunk.write_bytes(b"x" * len(chunk.read_bytes()))
-    assert "checksum" in dict(verify(local))[REF.path]
-    assert [row.path for row in collect(local, older_than_h=None, dry_run=True)] == [REF.path]
-    collect(local, older_than_h=None, dry_run=False)
-    assert [row.path for row in entries(local)] == [OTHER.path]
+    assert "checksum" in verify(local)[REF.path]
+    assert [entry.path for entry in collect_garbage(local, older_than_h=None, dry_run=True)] == [REF.path]
+    collect_garbage(local, older_than_h=None, dry_run=False)
+    assert [entry.path for entry in list_entries(local)] == [OTHER.path]
 
 
-def test_what_a_killed_run_half_wrote_above_an_entry_goes_with_the_next_one(local: Store):
+def test_temporary_files_of_a_killed_run_are_removed_by_the_next(local: Store):
     folder = Path(local.place)
     above = [folder, folder / "features", folder / "features/toy/t0"]
     for group in above:
@@ -212,7 +212,7 @@ def test_what_a_killed_run_half_wrote_above_an_entry_goes_with_the_next_one(loca
     assert all((group / "zarr.json").exists() for group in above)
 
 
-def test_documents_of_groups_are_written_once(local: Store):
+def test_metadata_of_parent_groups_is_written_once(local: Store):
     fill(local)
     above = [group / "zarr.json" for group in entry_folder(local).parents if group.is_relative_to(local.place)]
     assert len(above) == 5
@@ -260,7 +260,7 @@ def _fill_counting(root: str, counter) -> None:
     Store(LocalStoreConfig(root=root)).fill({REF: LAYOUT}, rows=ROWS, batch=1, compute=count)
 
 
-def test_two_processes_that_want_the_same_entry_compute_it_once(tmp_path: Path):
+def test_two_processes_that_need_the_same_entry_compute_it_once(tmp_path: Path):
     context = multiprocessing.get_context("spawn")
     counter = context.Value("i", 0)
     both = [context.Process(target=_fill_counting, args=(str(tmp_path / "cache"), counter)) for _ in range(2)]
@@ -272,7 +272,7 @@ def test_two_processes_that_want_the_same_entry_compute_it_once(tmp_path: Path):
     assert counter.value == ROWS
 
 
-def test_a_folder_that_cannot_be_made_is_told_in_one_line(tmp_path: Path):
+def test_a_folder_that_cannot_be_created_is_reported_in_one_line(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match=r"store.root: found .*file/cache"):
         Store(LocalStoreConfig(root=str(tmp_path / "file" / "cache")))
