@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo train-embedded benchmark-embedded ablations sweeps ladder comparison report bench test test-fast test-faults lint clean
+.PHONY: help setup gl demo pictures train-embedded benchmark-embedded ablations sweeps ladder comparison report bench test test-fast test-faults lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -46,6 +46,9 @@ gl: ## EGL for render=pyrender (render=raycast needs no system package)
 demo: $(STAMP) ## poses of procedural objects in cluttered scenes, errors against the exact ground truth, one page
 	$(PY) -m pipeline dataset=demo $(ARGS)
 	$(PY) -m pipeline dataset=demo step=report $(ARGS)
+
+pictures: $(STAMP) ## the pictures of README and docs again; ARGS=--diagrams for the SVG files alone
+	$(PY) docs/pictures.py $(ARGS)
 
 ablations: $(STAMP) ## the paper's ablations on the demo data; ARGS="dataset=lmo dataset.root=..." for others
 	$(PY) -m pipeline dataset=demo method=dzop $(ARGS)
