@@ -41,8 +41,10 @@ from pipeline.cli.score import lint_command, score_command
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.checkpoints import NotDownloaded, offline
 from pipeline.io.files import write_atomic
+from pipeline.options import Evaluate, Options, Select
+from pipeline.outputs.records import write_failure_record
 from pipeline.route import SecondLook, Stages
-from pipeline.run import Evaluate, Options, Select, make_report, note_failure, run
+from pipeline.run import make_report, run
 from pipeline.spec import build
 from pipeline.store import Store
 
@@ -170,7 +172,7 @@ def _give_up(config: DictConfig, error: DzopError) -> None:
     except OmegaConfBaseException:  # a value that stands for another which is not there
         plain = OmegaConf.to_container(config, resolve=False)
     values = cast(dict[str, Any], _writable(plain))
-    note_failure(values.get("out", "results"), values, overrides, message)
+    write_failure_record(values.get("out", "results"), values, overrides, message)
 
 
 def _writable(value: Any) -> Any:

@@ -214,7 +214,7 @@ def _graph_of(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str)
     stages, dataset, targets, store = run
     graph = Graph(Context(stages, dataset, targets, Store(store), runtime))
     graph.check()
-    graph.hold_to_vram()
+    graph.limit_vram()
     return graph
 
 

@@ -209,13 +209,13 @@ def test_an_image_without_a_proposal_answers_why(painted: Path, cache: Path):
 
 def test_a_plan_ends_with_detections_that_are_not_there(painted: Path, tmp_path: Path):
     graph = graph_of(painted, tmp_path)
-    nodes = graph.plan()
+    nodes = list(graph.plan())
     assert CALLS == []
     assert {node.state for node in nodes} == {"missing"}
     assert (nodes[-1].step, "not listed" in nodes[-1].cost) == ("detections", True)
     assert {node.step for node in nodes} >= {"templates", "template features", "proposals", "proposal features"}
     graph_of(painted, tmp_path).estimate()
-    warm = graph_of(painted, tmp_path).plan()
+    warm = list(graph_of(painted, tmp_path).plan())
     assert {node.state for node in warm} == {"cached"}
     assert "poses" in {node.step for node in warm}
 

@@ -26,7 +26,8 @@ from pipeline.graph.checks import detection_warnings
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
-from pipeline.graph.plan import Node, Plan
+from pipeline.graph.plan import KEY_DIGITS, Node, Plan
+from pipeline.graph.plan_text import plan_costs, plan_table
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
@@ -41,6 +42,7 @@ from pipeline.scoring import Scorer
 from pipeline.stages.fuse import TrainedFuser
 
 __all__ = [
+    "KEY_DIGITS",
     "Context",
     "Counts",
     "Graph",
@@ -50,6 +52,8 @@ __all__ = [
     "Retraced",
     "ScoreNodes",
     "Workers",
+    "plan_costs",
+    "plan_table",
     "use_threads",
 ]
 
@@ -98,8 +102,8 @@ class Graph:
         need = need_of(self.context, self.detections.proposals)
         return memory_of(self.context, need if passes else replace(need, weights=0, footprint=None))
 
-    def hold_to_vram(self) -> None:
-        """What torch keeps of the device's memory for later counts against its budget as well."""
+    def limit_vram(self) -> None:
+        """Limit torch's allocator, including the memory it caches, to ``runtime.max_vram``."""
         vram, device = self.context.runtime.vram_bytes, self.context.device
         if vram is not None and device.startswith("cuda"):
             total = torch.cuda.get_device_properties(device).total_memory
@@ -152,10 +156,6 @@ class Graph:
         """Shows how answers came about."""
         return Retracer(self.templates, self.queries, self.poses)
 
-    def plan(self) -> list[Node]:
-        """Every node with its state, key, size and cost."""
-        return list(self.planned())
-
-    def planned(self) -> Iterator[Node]:
-        """The nodes of a plan one by one. Raises NotDownloaded where weights decide that are not here."""
+    def plan(self) -> Iterator[Node]:
+        """Every node with its state, key, size and cost. Raises NotDownloaded at a key that missing weights decide."""
         return Plan(self.context, self.templates, self.queries, self.poses, self.detections).nodes()

@@ -15,6 +15,7 @@ from pipeline.graph.timings import timing_key
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.store import Layout, Ref
 
+KEY_DIGITS = 12  # of a key, in tables and in names of folders
 TEMPLATE_PIXEL_BYTES = 7  # rgb and float32 depth, before compression
 
 
