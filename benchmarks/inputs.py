@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d
 
 from pipeline.fits import Fit, Fitted
 from pipeline.functional import rigid
+from pipeline.graph.context import stack_crops
 from pipeline.items.views import Crops, Geometry
 from pipeline.route import Query, TemplateView
 from pipeline.spec import Runtime
@@ -79,10 +80,8 @@ def scene(shapes: Mapping[int, tuple[int, int]], *, device: str = "cpu", views: 
     _, depth_mm = renderer.render(mesh, K, poses, size_hw)
     crop, rgb = Square(), np.zeros((*size_hw, 3), dtype=np.uint8)
     whole = (-0.5, -0.5, size_hw[1] - 0.5, size_hw[0] - 0.5)
-    cropped = [crop(rgb, depth > 0, whole, K) for depth in depth_mm]
-    rgb_crops, mask_crops, A_crop_img = (np.stack(part) for part in zip(*cropped, strict=True))
     geometry = Geometry(list(depth_mm), np.repeat(K[None], len(poses), 0), poses)
-    crops = Crops(rgb_crops, mask_crops, A_crop_img, geometry)
+    crops = Crops(**stack_crops([crop(rgb, depth > 0, whole, K) for depth in depth_mm]), geometry=geometry)
     maps = {layer: m.to(device) for layer, m in _mixed(crops, shapes, seed=seed).items()}
     masks = torch.from_numpy(crops.mask).to(device)
     each = [{layer: m[i] for layer, m in maps.items()} for i in range(len(poses))]

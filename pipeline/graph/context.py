@@ -17,7 +17,7 @@ from pipeline.graph.lru import LRUCache
 from pipeline.graph.tasks import Advance, Item, Task, Workers
 from pipeline.graph.timings import Timings, timing_key
 from pipeline.items.objects import ObjectModel
-from pipeline.items.views import Crops, Target
+from pipeline.items.views import Crop, Crops, Target
 from pipeline.progress import Progress
 from pipeline.route import Stages
 from pipeline.spec import Runtime
@@ -192,10 +192,9 @@ class Context:
         return {layer: _half(maps[layer], layer) for layer in layers}
 
 
-def stack_crops(crops: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Rows of a crops entry from what the crop stage returns."""
-    rgb, mask, A_crop_img = (np.stack(parts) for parts in zip(*crops, strict=True))
-    return {"rgb": rgb, "mask": mask, "A_crop_img": A_crop_img}
+def stack_crops(crops: Sequence[Crop]) -> dict[str, np.ndarray]:
+    """Rows of a crops entry, one for each crop."""
+    return {name: np.stack([getattr(crop, name) for crop in crops]) for name in ("rgb", "mask", "A_crop_img")}
 
 
 def _mesh_bytes(model: ObjectModel) -> int:

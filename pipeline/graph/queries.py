@@ -17,7 +17,7 @@ from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
 from pipeline.io.digests import file_digest
-from pipeline.items.views import Crops, Detection, Geometry
+from pipeline.items.views import Crop, Crops, Detection, Geometry
 from pipeline.route import Query
 from pipeline.spec import digest
 from pipeline.stages.render.raycast import render_depth
@@ -126,7 +126,7 @@ class QueryNodes:
         )
         return self.found(image)
 
-    def _cropped(self, image: ImageId) -> tuple[list[tuple[np.ndarray, np.ndarray, np.ndarray]], dict[str, object]]:
+    def _cropped(self, image: ImageId) -> tuple[list[Crop], dict[str, object]]:
         """Crops, and which of the image's usable detections they are or why there is none."""
         usable = self.of_image[image]
         photo = self.context.dataset.image(*image)

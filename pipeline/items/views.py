@@ -31,6 +31,15 @@ class Geometry:
 
 
 @dataclass(frozen=True, eq=False)
+class Crop:
+    """One square crop of a view: black outside ``mask``; the homography A_crop_img takes image to crop pixels."""
+
+    rgb: UInt8[np.ndarray, "S S 3"]
+    mask: Bool[np.ndarray, "S S"]
+    A_crop_img: Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, eq=False)
 class Crops:
     """Square crops of n views: background removed (black) outside ``mask``; A_crop_img takes image to crop pixels."""
 

@@ -21,23 +21,27 @@ def _scene() -> tuple[np.ndarray, np.ndarray]:
 
 def test_image_enlarged_three_times_gives_the_same_crop():
     rgb, mask = _scene()
-    crop, crop_mask, A = Square(size=24)(rgb, mask, WHOLE, K)
-    large, large_mask, A_large = Square(size=24)(*(a.repeat(3, 0).repeat(3, 1) for a in (rgb, mask)), WHOLE, K)
-    assert np.abs(crop.astype(int) - large).max() <= 1  # float32 sums may round a half the other way
-    assert np.array_equal(crop_mask, large_mask)
+    crop = Square(size=24)(rgb, mask, WHOLE, K)
+    large = Square(size=24)(*(a.repeat(3, 0).repeat(3, 1) for a in (rgb, mask)), WHOLE, K)
+    assert np.abs(crop.rgb.astype(int) - large.rgb).max() <= 1  # float32 sums may round a half the other way
+    assert np.array_equal(crop.mask, large.mask)
     corner = np.array([[30.0, 20.0]])
-    assert np.allclose(apply_homography(A, corner), apply_homography(A_large, 3 * corner + 1), atol=1e-9)
+    assert np.allclose(
+        apply_homography(crop.A_crop_img, corner), apply_homography(large.A_crop_img, 3 * corner + 1), atol=1e-9
+    )
 
 
 def test_image_moved_by_whole_pixels_gives_the_same_crop():
     rgb, mask = _scene()
     moved = (np.pad(rgb, ((7, 0), (11, 0), (0, 0))), np.pad(mask, ((7, 0), (11, 0))))
-    for a, b in zip(Square()(rgb, mask, WHOLE, K)[:2], Square()(*moved, WHOLE, K)[:2], strict=True):
-        assert np.abs(a.astype(int) - b).max() <= 1  # A's last bits differ, a half may round the other way
+    still, shifted = Square()(rgb, mask, WHOLE, K), Square()(*moved, WHOLE, K)
+    # A's last bits differ, a half may round the other way
+    assert np.abs(still.rgb.astype(int) - shifted.rgb).max() <= 1
+    assert np.array_equal(still.mask, shifted.mask)
 
 
 def test_mask_fills_the_crop_up_to_the_padding():
-    _, crop_mask, _ = Square(size=120, padding_ratio=1.2)(*_scene(), WHOLE, K)
+    crop_mask = Square(size=120, padding_ratio=1.2)(*_scene(), WHOLE, K).mask
     rows, columns = np.flatnonzero(crop_mask.any(1)), np.flatnonzero(crop_mask.any(0))
     assert (rows[0], rows[-1]) == (10, 109)  # 50 px of 60 in height
     assert (columns[0], columns[-1]) == (20, 99)  # 40 px of 60 in width
@@ -47,30 +51,30 @@ def test_mask_fills_the_crop_up_to_the_padding():
 def test_background_never_reaches_the_crop(variant):
     rgb, mask = _scene()
     other = np.where(mask[..., None], rgb, 255 - rgb)
-    assert np.array_equal(variant()(rgb, mask, WHOLE, K)[0], variant()(other, mask, WHOLE, K)[0])
+    assert np.array_equal(variant()(rgb, mask, WHOLE, K).rgb, variant()(other, mask, WHOLE, K).rgb)
     kept = variant(background="keep")
-    assert not np.array_equal(kept(rgb, mask, WHOLE, K)[0], kept(other, mask, WHOLE, K)[0])
+    assert not np.array_equal(kept(rgb, mask, WHOLE, K).rgb, kept(other, mask, WHOLE, K).rgb)
 
 
 @pytest.mark.parametrize("variant", [Square, Virtual])
 def test_box_counts_only_without_a_mask(variant):
     rgb, mask = _scene()
     with_mask = variant()(rgb, mask, (0.0, 0.0, 5.0, 5.0), K)
-    crop, crop_mask, A = variant()(rgb, None, (29.5, 19.5, 69.5, 69.5), K)
-    assert np.array_equal(A, with_mask[2])
-    assert crop_mask.sum() > with_mask[1].sum()
-    assert crop[crop_mask].min() > 0
+    crop = variant()(rgb, None, (29.5, 19.5, 69.5, 69.5), K)
+    assert np.array_equal(crop.A_crop_img, with_mask.A_crop_img)
+    assert crop.mask.sum() > with_mask.mask.sum()
+    assert crop.rgb[crop.mask].min() > 0
 
 
 def test_object_at_the_border_stays_where_it_is():
     rgb = np.full((40, 40, 3), 200, np.uint8)
     mask = np.zeros((40, 40), bool)
     mask[:10, :10] = True
-    crop, crop_mask, A = Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, K)
-    assert np.array_equal(A[:2, 2], [10.5, 10.5])  # two crop pixels a pixel, image edge -0.5 at crop edge 9.5
-    assert not crop[:9].any()
-    assert not crop_mask[:10].any()
-    assert crop_mask[10:30, 10:30].all()
+    crop = Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, K)
+    assert np.array_equal(crop.A_crop_img[:2, 2], [10.5, 10.5])  # two crop px a pixel, image edge -0.5 at crop edge 9.5
+    assert not crop.rgb[:9].any()
+    assert not crop.mask[:10].any()
+    assert crop.mask[10:30, 10:30].all()
 
 
 def test_what_the_virtual_camera_shows_is_where_its_projection_says():
@@ -83,12 +87,12 @@ def test_what_the_virtual_camera_shows_is_where_its_projection_says():
     low, high = px.min(0) - 4, px.max(0) + 4
     for n, dot in enumerate(dots):
         rgb = np.rint(255 * dot)[..., None].repeat(3, -1).astype(np.uint8)
-        crop, _, A = Virtual(size=200)(rgb, None, (*low, *high), far)
-        K_crop, R_crop_cam = crop_camera(A, far)
-        weight = crop[..., 0].astype(float)
+        crop = Virtual(size=200)(rgb, None, (*low, *high), far)
+        K_crop, R_crop_cam = crop_camera(crop.A_crop_img, far)
+        weight = crop.rgb[..., 0].astype(float)
         seen = np.array([(weight * axis).sum() for axis in np.mgrid[:200, :200][::-1]]) / weight.sum()
         expected = project(K_crop, R_crop_cam @ points[n])
-        error = np.abs(seen - expected).max() / local_zoom(A, px[n])
+        error = np.abs(seen - expected).max() / local_zoom(crop.A_crop_img, px[n])
         assert error < 0.1  # image px; a dot's centre of mass is not quite the image of its centre
 
 
@@ -96,21 +100,21 @@ def test_virtual_crop_at_the_border_stays_where_it_is():
     rgb, mask = np.full((40, 40, 3), 200, np.uint8), np.zeros((40, 40), bool)
     mask[:10, :10] = True
     straight = np.array([[60.0, 0.0, 4.5], [0.0, 60.0, 4.5], [0.0, 0.0, 1.0]])  # looks at the mask's centre
-    crop, crop_mask, A = Virtual(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, straight)
-    np.testing.assert_allclose(A, Square(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, straight)[2], atol=1e-12)
-    assert not crop[:9].any()
-    assert crop_mask[10:30, 10:30].all()
-    assert not crop_mask[:10].any()
+    crop, flat = (variant(size=40, padding_ratio=2.0)(rgb, mask, WHOLE, straight) for variant in (Virtual, Square))
+    np.testing.assert_allclose(crop.A_crop_img, flat.A_crop_img, atol=1e-12)
+    assert not crop.rgb[:9].any()
+    assert crop.mask[10:30, 10:30].all()
+    assert not crop.mask[:10].any()
 
 
 def test_a_turned_virtual_camera_sees_the_object_in_the_middle():
     rgb, mask = _scene()
-    _, crop_mask, A = Virtual(size=60)(rgb, mask, WHOLE, K)
-    assert A[2, 0] != 0  # K is wide: the mask's centre is 14 degrees off the axis
-    corners = apply_homography(A, np.array([[29.5, 19.5], [69.5, 69.5]]))
+    crop = Virtual(size=60)(rgb, mask, WHOLE, K)
+    assert crop.A_crop_img[2, 0] != 0  # K is wide: the mask's centre is 14 degrees off the axis
+    corners = apply_homography(crop.A_crop_img, np.array([[29.5, 19.5], [69.5, 69.5]]))
     assert (corners > -0.5).all()
     assert (corners < 59.5).all()
-    assert crop_mask.any(0).sum() > 35
+    assert crop.mask.any(0).sum() > 35
 
 
 @pytest.mark.parametrize("variant", [Square, Virtual])

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.errors import NoPose
 from pipeline.functional.camera import mask_bbox
+from pipeline.items.views import Crop
 from pipeline.spec import Variant
 
 HALF = 0.5 - 1e-5  # half covered in float32 still counts as half
@@ -31,11 +32,8 @@ class Cropper(Variant, Protocol):
         mask: Bool[np.ndarray, "H W"] | None,
         bbox_xyxy: BBox,
         K: Float[np.ndarray, "3 3"],
-    ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
-        """rgb, mask and A_crop_img, a homography; without a mask the box's area is the mask.
-
-        Raises NoPose for an empty mask.
-        """
+    ) -> Crop:
+        """The crop around the mask, or around the box where ``mask`` is None. Raises NoPose for an empty mask."""
         ...
 
 

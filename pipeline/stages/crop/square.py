@@ -10,6 +10,7 @@ from pydantic import Field
 
 from pipeline.functional.camera import square_crop
 from pipeline.functional.resample import resample
+from pipeline.items.views import Crop
 from pipeline.spec import Positive, Spec, spec
 from pipeline.stages.crop import HALF, BBox, locate_object
 
@@ -37,10 +38,10 @@ class Square(Spec):
         mask: Bool[np.ndarray, "H W"] | None,
         bbox_xyxy: BBox,
         K: Float[np.ndarray, "3 3"],
-    ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
-        """rgb, mask and A_crop_img, a scale and a shift; K plays no part. Raises NoPose as ``locate_object`` does."""
+    ) -> Crop:
+        """A_crop_img is a scale and a shift; K is not used. Raises NoPose as ``locate_object`` does."""
         area, box = locate_object(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
         A_crop_img = square_crop(box, size=self.size, padding_ratio=self.padding_ratio)
         shown = rgb * area[..., None] if self.background == "remove" else rgb
         crop = np.rint(resample(shown, A_crop_img, size=self.size)).clip(0, 255).astype(np.uint8)
-        return crop, resample(area, A_crop_img, size=self.size) >= HALF, A_crop_img
+        return Crop(crop, resample(area, A_crop_img, size=self.size) >= HALF, A_crop_img)

@@ -11,6 +11,7 @@ from pydantic import Field
 from pipeline.errors import NoPose
 from pipeline.functional.camera import virtual_crop
 from pipeline.functional.resample import warp
+from pipeline.items.views import Crop
 from pipeline.spec import Positive, Spec, spec
 from pipeline.stages.crop import HALF, BBox, format_box, locate_object
 
@@ -42,10 +43,10 @@ class Virtual(Spec):
         mask: Bool[np.ndarray, "H W"] | None,
         bbox_xyxy: BBox,
         K: Float[np.ndarray, "3 3"],
-    ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "3 3"]]:
-        """rgb, mask and the homography A_crop_img = K_virtual R K^-1.
+    ) -> Crop:
+        """A_crop_img is the homography K_virtual R K^-1.
 
-        Raises NoPose as ``locate_object`` does, and for a box that no camera can see as a whole.
+        Raises NoPose as ``locate_object`` does, and for a box that reaches a right angle away from its centre.
         """
         area, box = locate_object(mask, bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
         try:
@@ -54,4 +55,4 @@ class Virtual(Spec):
             raise NoPose("crop", f"box {format_box(box)} with this K: {reason}") from None
         shown = rgb * area[..., None] if self.background == "remove" else rgb
         both = warp(np.dstack([shown, area]), A_crop_img, size=self.size)
-        return np.rint(both[..., :3]).clip(0, 255).astype(np.uint8), both[..., 3] >= HALF, A_crop_img
+        return Crop(np.rint(both[..., :3]).clip(0, 255).astype(np.uint8), both[..., 3] >= HALF, A_crop_img)
