@@ -218,7 +218,9 @@ def _find(view: _View, truths: Sequence[GroundTruth], counted: list[GroundTruth]
     shift = np.array([[e.mspd_px for e in line] for line in table]).reshape(shape)
     surface = np.array([[e.vsd or np.ones(len(TAUS)) for e in line] for line in table]).reshape(*shape, len(TAUS))
     by_tau = [_hits(surface[..., tau], THETAS) for tau in range(len(TAUS))]
-    return _Found(counted, errors, _hits(relative, THETAS), _hits(shift, MSPD_PX), np.stack(by_tau, axis=1))
+    return _Found(
+        counted, errors, _hits(relative, THETAS), _hits(shift, MSPD_PX.astype(float)), np.stack(by_tau, axis=1)
+    )
 
 
 def pose_errors(

@@ -132,7 +132,7 @@ def _relief(rng: Rng) -> Callable[[Points], Points]:
     return gradient
 
 
-Waves = tuple[Float[np.ndarray, "w 3"], Values, Values]
+Waves = tuple[Float[np.ndarray, "w 3"], Float[np.ndarray, " w"], Float[np.ndarray, " w"]]
 
 
 def _waves(rng: Rng, *, fastest: float) -> Waves:

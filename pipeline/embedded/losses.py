@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -25,8 +25,8 @@ def reconstruction_loss(
 
 
 def sides(
-    maps: Float[Tensor, "n d h w"], batch: PairBatch
-) -> tuple[Float[Tensor, "b c q d h w"], Float[Tensor, "b c t d h w"]]:
+    maps: Shaped[Tensor, "n d h w"], batch: PairBatch
+) -> tuple[Shaped[Tensor, "b c q d h w"], Shaped[Tensor, "b c t d h w"]]:
     """Maps of queries and of templates, by object and cluster."""
     b, c, q, t = batch.matched.shape[:4]
     by_cluster = maps.unflatten(0, (b, c, q + t))

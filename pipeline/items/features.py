@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-FeatureMaps = Mapping[int, Float[Tensor, "n c h w"]]
-"""layer -> maps of n crops; the map of layer l covers the whole crop with h x w equal cells."""
+FeatureMaps = Mapping[int, Float[Tensor, "n _c _h _w"]]
+"""layer -> maps of n crops. A layer's map covers the whole crop with h x w equal cells; c, h, w depend on the layer."""
 
 SALIENCY_LAYER = -1
 """Where a transformer gives the class token's attention, (1 h w): an extractor that has none knows no such layer."""

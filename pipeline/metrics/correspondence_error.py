@@ -15,7 +15,7 @@ def correspondence_errors_mm(
     K: Float[np.ndarray, "3 3"],
     T_gt: Float[np.ndarray, "4 4"],
     symmetries: Float[np.ndarray, "s 4 4"],
-) -> Float[np.ndarray, " m"]:
+) -> Float[np.ndarray, " finite"]:
     """Distance (mm) of each object point from the ray of its query pixel, parallel to the image plane.
 
     Under the symmetry for which the median is least; rows with NaN are left out. Depth along the ray is not compared: a

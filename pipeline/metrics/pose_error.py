@@ -54,7 +54,7 @@ def mspd(
     K: Float[np.ndarray, "3 3"],
     vertices: Vertices,
     symmetries: Float[np.ndarray, "s 4 4"],
-    probes: Vertices | None = None,
+    probes: Float[np.ndarray, "p 3"] | None = None,
 ) -> float:
     """Maximum symmetry-aware projection distance, pixels of the image of K (Hodan et al., ECCVW 2020, section 2.2).
 
@@ -101,7 +101,7 @@ def _largest_shift(
     return _finite([np.linalg.norm(px - seen_px, axis=-1).max(axis=-1) for px in placed])
 
 
-def _finite(blocks: list[Float[np.ndarray, " b"]]) -> Float[np.ndarray, " s"]:
+def _finite(blocks: list[Float[np.ndarray, " _b"]]) -> Float[np.ndarray, " s"]:
     """One array; a vertex in the camera's plane, which has no projection, counts as infinitely far."""
     return np.nan_to_num(np.concatenate(blocks), nan=np.inf, posinf=np.inf)
 
@@ -110,6 +110,6 @@ def _placed(T: Float[np.ndarray, "s 4 4"], vertices: Vertices) -> Float[np.ndarr
     return vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
 
 
-def _blocks(symmetries: Float[np.ndarray, "s 4 4"], vertex_count: int) -> list[Float[np.ndarray, "b 4 4"]]:
+def _blocks(symmetries: Float[np.ndarray, "s 4 4"], vertex_count: int) -> list[Float[np.ndarray, "_b 4 4"]]:
     rows = max(1, _BLOCK_FLOATS // (3 * vertex_count))
     return [symmetries[i : i + rows] for i in range(0, len(symmetries), rows)]

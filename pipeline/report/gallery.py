@@ -44,7 +44,7 @@ _PALETTE = np.array(
     dtype=np.float32,
 )
 
-Picture = UInt8[np.ndarray, "H W 3"]
+Picture = UInt8[np.ndarray, "_H _W 3"]
 Colour = tuple[int, int, int]
 
 

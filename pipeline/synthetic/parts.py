@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from pipeline.functional.viewpoints import icosphere_mesh
 
-Shape = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
+Shape = tuple[Float[np.ndarray, "_v 3"], Int[np.ndarray, "_f 3"]]
 Rng = np.random.Generator
 
 

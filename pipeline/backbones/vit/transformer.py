@@ -113,7 +113,7 @@ def project_facet(block: nn.Module, tokens: Float[Tensor, "n t c"], facet: str) 
 
 def saliency(
     block: nn.Module, tokens: Float[Tensor, "n t c"], *, heads: Sequence[int], model: Any, skipped: int
-) -> Float[Tensor, "n t 1"]:
+) -> Float[Tensor, "n p 1"]:
     """The class token's attention to every patch, mean of ``heads``, from 0 (least) to 1 (most) in each image.
 
     Amir et al., ECCVW 2022, and their code. An image that is the same everywhere gives 0.

@@ -29,7 +29,7 @@ class Cropper(Variant, Protocol):
     def __call__(
         self,
         rgb: UInt8[np.ndarray, "H W 3"],
-        mask: Bool[np.ndarray, "H W"] | None,
+        mask: Bool[np.ndarray, "h w"] | None,
         bbox_xyxy: BBox,
         K: Float[np.ndarray, "3 3"],
     ) -> Crop:
@@ -38,7 +38,7 @@ class Cropper(Variant, Protocol):
 
 
 def locate_object(
-    mask: Bool[np.ndarray, "H W"] | None, bbox_xyxy: BBox, size_hw: tuple[int, int]
+    mask: Bool[np.ndarray, "h w"] | None, bbox_xyxy: BBox, size_hw: tuple[int, int]
 ) -> tuple[Bool[np.ndarray, "H W"], BBox]:
     """The object's pixels and their box. With a mask, its own box counts, not the given one.
 

@@ -35,7 +35,7 @@ class Square(Spec):
     def __call__(
         self,
         rgb: UInt8[np.ndarray, "H W 3"],
-        mask: Bool[np.ndarray, "H W"] | None,
+        mask: Bool[np.ndarray, "h w"] | None,
         bbox_xyxy: BBox,
         K: Float[np.ndarray, "3 3"],
     ) -> Crop:
