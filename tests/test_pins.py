@@ -154,8 +154,8 @@ def summary(name: str) -> list[float]:
         return [float(np.array_equal(found, start)), *found[:3].round(4).flatten().tolist()]
     if stage == "crop":
         rgb = toy_crops().rgb[0]
-        crop, mask, A_crop_img = spec(rgb, disc(128).numpy(), (0.0, 0.0, 127.0, 127.0), toy_crops().geometry.K[0])
-        return [float(crop.mean()), float(mask.mean()), *A_crop_img[:2].flatten().tolist()]
+        crop = spec(rgb, disc(128).numpy(), (0.0, 0.0, 127.0, 127.0), toy_crops().geometry.K[0])
+        return [float(crop.rgb.mean()), float(crop.mask.mean()), *crop.A_crop_img[:2].flatten().tolist()]
     if stage == "extract":
         maps = spec.load(Runtime(device="cpu"))(toy_crops(), [2, 11])
         return [v for m in maps.values() for v in (float(m.shape[1]), float(m.float().mean()), float(m.float().std()))]
