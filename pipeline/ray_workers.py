@@ -1,8 +1,8 @@
-"""Work of a run on a Ray cluster: the only module that knows Ray (``pip install 'dzop[ray]'``).
+"""Run tasks on a Ray cluster. Only this module imports Ray (``pip install 'dzop[ray]'``).
 
-Workers are actors that hold the graph of the run, backbone included, and take one unit of work after the other.
-What they make goes through the store; what comes back is what was counted. Whoever dies is replaced, and its unit is
-done by the next worker that is free: the store keeps what was complete of it.
+Each worker is an actor that builds the run's graph once, backbone included, and computes one item after another.
+Results go through the store; only counts come back. A worker that dies is replaced, and its item is computed again by
+the next free worker, which reuses whatever the lost one had stored.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import os
 import socket
 import sys
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -26,21 +26,26 @@ from pipeline.store import MemoryStoreConfig, Store
 
 try:
     import ray
-    from ray import exceptions as faults
+    from ray import exceptions as ray_errors
 except ImportError:
     ray = None  # type: ignore[assignment]
 
-_STORE_BYTES = 100_000_000  # results travel through our store, so that Ray's own may be small
-_PATIENCE_S = 30.0
-_REACH_S = 10.0
-_ADDRESSES = "local, auto where `ray start` has run, host:6379 or ray://host:10001"
+Actor = Any
+Future = Any
+"""Ray's ObjectRef: the result of a remote call, which may still be running."""
+
+_OBJECT_STORE_BYTES = 100_000_000  # results go through the feature store, so Ray's own can be small
+_START_NOTICE_S = 30.0
+_CONNECT_TIMEOUT_S = 10.0
+_ADDRESSES = "local, auto (after `ray start`), host:6379 or ray://host:10001"
 
 
 @spec
 class RayRuntime(Runtime):
-    """Workers of a Ray cluster. ``address``: local, auto, host:port or ray://host:port; ``actors`` 0: as many as fit.
+    """Compute on workers of a Ray cluster.
 
-    ``gpus_per_actor`` None: one where the cluster has GPUs. ``retries``: how often a unit of work may lose its worker.
+    ``address``: local, auto, host:port or ray://host:port. ``actors``: number of workers, 0 = as many as fit.
+    ``gpus_per_actor``: None = one if the cluster has GPUs. ``retries``: how many workers an item may lose.
     """
 
     address: str = "local"
@@ -51,163 +56,187 @@ class RayRuntime(Runtime):
 
     @contextmanager
     def workers(self, run: Context, *, threads: int) -> Iterator[RayWorkers]:
-        """Workers that start when the first unit of work is missing, and end with the block."""
+        """Workers that start with the first item to compute and end with the block.
+
+        Raises BadInput without Ray or with a store that workers cannot share, DzopError when the cluster fails.
+        """
         if ray is None:
-            raise BadInput("runtime", found="ray without Ray", needed="pip install 'dzop[ray]'")
+            raise BadInput("runtime", found="ray, which is not installed", needed="pip install 'dzop[ray]'")
         if isinstance(run.store.config, MemoryStoreConfig):
             raise BadInput("store", found="memory with runtime=ray", needed="a store that workers share: local or s3")
         workers = RayWorkers(self, run, threads)
         try:
             yield workers
-        except faults.RayError as error:
-            raise DzopError(f"runtime.address={self.address}: {_brief(error)}; run again: the store is kept") from None
+        except ray_errors.RayError as error:
+            where = f"runtime.address={self.address}"
+            raise DzopError(f"{where}: {_first_line(error)}; run again: completed entries are kept") from None
         finally:
             workers.close()
 
 
-@dataclass(eq=False)
 class RayWorkers:
     """The workers of one run."""
 
-    runtime: RayRuntime
-    run: Context
-    threads: int
-    _idle: list[Any] = field(default_factory=list)
-    _starting: dict[Any, Any] = field(default_factory=dict)
-    _site: Any = None
-    _most: int = 0
-    _began: bool = False
+    def __init__(self, runtime: RayRuntime, run: Context, threads: int) -> None:
+        self.runtime, self.run, self.threads = runtime, run, threads
+        self._connected = False
+        self._max_workers = 0
+        self._setup: Future = None
+        self._starting: dict[Future, Actor] = {}
+        self._idle: list[Actor] = []
 
     def map(self, task: str, items: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
-        """As Workers.map."""
+        """See Workers.map."""
         self._start(len(items))
-        waiting, lost = deque(items), Counter[Any]()
-        busy: dict[Any, tuple[Any, Any]] = {}
+        waiting, losses = deque(items), Counter[Any]()
+        busy: dict[Future, tuple[Actor, Any]] = {}
         while waiting or busy:
             while waiting and self._idle:
                 worker, item = self._idle.pop(), waiting.popleft()
                 busy[worker.do.remote(task, item)] = worker, item
-            for answer in self._answers(busy):
-                worker, item = busy.pop(answer)
-                try:
-                    counts, fault = ray.get(answer)
-                except faults.RayTaskError:
-                    raise  # a fault of ours, with its trace
-                except (faults.RayActorError, faults.WorkerCrashedError, faults.ObjectLostError) as error:
-                    lost[item] += 1
-                    if lost[item] > self.runtime.retries:
-                        told = f"{task} of {item}: lost {lost[item]} workers, the last with: {_brief(error)}"
-                        raise DzopError(f"{told}; often for want of memory: fewer runtime.actors") from None
-                    self._say(f"{task} of {item}: its worker was lost; another goes on with it")
+            for future in self._wait(busy):
+                worker, item = busy.pop(future)
+                result = _get_result(future)
+                if isinstance(result, Exception):
+                    losses[item] += 1
+                    self._report_loss(f"{task} of {item}", losses[item], result)
                     waiting.appendleft(item)
-                    self._hire()
-                else:
-                    self._idle.append(worker)
-                    if fault:
-                        raise DzopError(fault)
-                    yield item, counts
+                    self._start_worker()
+                    continue
+                self._idle.append(worker)
+                yield item, result
 
-    def _answers(self, busy: dict[Any, Any]) -> list[Any]:
-        """Answers that are there, once one is; workers that have started meanwhile are idle then."""
-        asked = [*busy, *self._starting]
-        there, _ = ray.wait(asked, num_returns=1, timeout=_PATIENCE_S)
-        if not there and not busy:
-            self._say(f"no worker has started for {_PATIENCE_S:.0f} s: the cluster has no room, or is busy; waiting")
-        for started in [answer for answer in there if answer in self._starting]:
-            worker = self._starting.pop(started)
-            try:
-                fault = ray.get(started)
-            except faults.RayActorError as error:
-                if isinstance(error.__cause__, faults.RayTaskError):
-                    raise
-                raise DzopError(f"a worker could not start: {_brief(error)}") from None
-            if fault:
-                raise DzopError(f"a worker could not start: {fault}")
-            self._idle.append(worker)
-        return [answer for answer in there if answer in busy]
+    def _wait(self, busy: Collection[Future]) -> list[Future]:
+        """Wait until an item is finished or a worker has started; returns the futures of finished items."""
+        ready, _ = ray.wait([*busy, *self._starting], num_returns=1, timeout=_START_NOTICE_S)
+        if not ready and not busy:
+            _report(f"no worker has started for {_START_NOTICE_S:.0f} s: the cluster is full or busy; still waiting")
+        for future in ready:
+            if future in self._starting:
+                _check_started(future)
+                self._idle.append(self._starting.pop(future))
+        return [future for future in ready if future in busy]
+
+    def _report_loss(self, item: str, losses: int, error: Exception) -> None:
+        """Print that an item lost its worker. Raises DzopError when it has lost too many."""
+        if losses > self.runtime.retries:
+            found = f"{item}: lost {losses} workers, the last with: {_first_line(error)}"
+            raise DzopError(f"{found}; often out of memory: try fewer runtime.actors") from None
+        _report(f"{item}: its worker was lost; retrying on another")
 
     # --- starting and ending -----------------------------------------------------------------------------------------
 
-    def _start(self, units: int) -> None:
-        """Connect to the cluster, and as many workers as there are units and room for."""
-        if not self._began:
+    def _start(self, items: int) -> None:
+        """Connect to the cluster once, then start workers: at most one per item, and no more than fit."""
+        if not self._connected:
             _connect(self.runtime.address)
-            self._began = True
-            self._most = self._room()
-            self._site = ray.put(_site_of(self.run, self.runtime, self.threads))
-        for _ in range(min(units, self._most) - len(self._idle) - len(self._starting)):
-            self._hire()
+            self._connected = True
+            self._max_workers = self._fit_workers()
+            self._setup = ray.put(_worker_setup(self.run, self.runtime, self.threads))
+        for _ in range(min(items, self._max_workers) - len(self._idle) - len(self._starting)):
+            self._start_worker()
 
-    def _hire(self) -> None:
-        actor: Any = ray.remote(num_cpus=self.runtime.cpus_per_actor, num_gpus=self._gpus)(Worker)
-        worker = actor.remote(self._site)
-        self._starting[worker.ready.remote()] = worker
+    def _start_worker(self) -> None:
+        actor: Any = ray.remote(num_cpus=self.runtime.cpus_per_actor, num_gpus=self._gpus_per_worker())(Worker)
+        worker = actor.remote(self._setup)
+        self._starting[worker.startup_error.remote()] = worker
 
-    @property
-    def _gpus(self) -> float:
-        asked, there = self.runtime.gpus_per_actor, ray.cluster_resources().get("GPU", 0)
-        if asked is None:
-            return 1.0 if there and self.runtime.device != "cpu" else 0.0
-        return asked
+    def _gpus_per_worker(self) -> float:
+        if self.runtime.gpus_per_actor is not None:
+            return self.runtime.gpus_per_actor
+        return 1.0 if ray.cluster_resources().get("GPU", 0) and self.runtime.device != "cpu" else 0.0
 
-    def _room(self) -> int:
-        """How many workers the cluster has room for, or are asked for. Raises BadInput where it has less."""
-        there = ray.cluster_resources()
-        wants = {"CPU": self.runtime.cpus_per_actor, "GPU": self._gpus}
-        room = min(int(there.get(name, 0) / amount + 1e-6) for name, amount in wants.items() if amount)
-        if room < max(self.runtime.actors, 1):
-            has = ", ".join(f"{there.get(name, 0):g} {name}s" for name in wants)
-            each = " and ".join(f"{amount:g} {name}" for name, amount in wants.items())
-            found = f"{self.runtime.actors or 1} of {each} each on a cluster of {has}"
-            raise BadInput("runtime.actors", found=found, needed=f"at most {room}" if room else "less for each of them")
-        return self.runtime.actors or room
-
-    def _say(self, text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
+    def _fit_workers(self) -> int:
+        """The configured number of workers, or as many as fit. Raises BadInput when the cluster is too small."""
+        resources = ray.cluster_resources()
+        needs = {"CPU": self.runtime.cpus_per_actor, "GPU": self._gpus_per_worker()}
+        fitting = min(int(resources.get(name, 0) / amount + 1e-6) for name, amount in needs.items() if amount)
+        if fitting < max(self.runtime.actors, 1):
+            available = ", ".join(f"{resources.get(name, 0):g} {name}s" for name in needs)
+            each = " and ".join(f"{amount:g} {name}" for name, amount in needs.items())
+            found = f"{self.runtime.actors or 1} of {each} each on a cluster of {available}"
+            needed = f"at most {fitting}" if fitting else "smaller cpus_per_actor or gpus_per_actor"
+            raise BadInput("runtime.actors", found=found, needed=needed)
+        return self.runtime.actors or fitting
 
     def close(self) -> None:
-        """End all workers; a cluster of our own ends with them, any other stays."""
-        if self._began:
+        """Stop all workers and disconnect; a cluster that this process started ends too."""
+        if self._connected:
             self._idle.clear()
             self._starting.clear()
             ray.shutdown()
 
 
+def _get_result(future: Future) -> Counts | Exception:
+    """Counts of a finished item; Ray's error if its worker was lost. Raises DzopError with the worker's message."""
+    try:
+        counts, message = ray.get(future)
+    except ray_errors.RayTaskError:
+        raise  # a bug: keep the worker's traceback
+    except (ray_errors.RayActorError, ray_errors.WorkerCrashedError, ray_errors.ObjectLostError) as error:
+        return error
+    if message:
+        raise DzopError(message)
+    return counts
+
+
+def _check_started(future: Future) -> None:
+    """Raise DzopError if a worker could not start."""
+    try:
+        message: Any = ray.get(future)
+    except ray_errors.RayActorError as error:
+        if isinstance(error.__cause__, ray_errors.RayTaskError):
+            raise  # a bug: keep the worker's traceback
+        message = _first_line(error)
+    if message:
+        raise DzopError(f"a worker could not start: {message}")
+
+
+def _report(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+# --- in a worker's process --------------------------------------------------------------------------------------------
+
+
 class Worker:
-    """An actor: the run's graph in another process, which takes units of work."""
+    """An actor that holds the run's graph in its own process.
 
-    def __init__(self, site: dict[str, Any]) -> None:
-        self.fault, self.graph = "", None
+    Errors that a user can fix are returned as one-line messages, because Ray would wrap exceptions in its own.
+    """
+
+    def __init__(self, setup: dict[str, Any]) -> None:
+        self.error, self.graph = "", None
         try:
-            self.graph = _graph_of(**site)
+            self.graph = _build_graph(**setup)
         except DzopError as error:
-            self.fault = str(error)
+            self.error = str(error)
 
-    def ready(self) -> str:
-        """What kept it from starting, in one line; empty for nothing."""
-        return self.fault
+    def startup_error(self) -> str:
+        """Message of the error that prevented the start; empty if there was none."""
+        return self.error
 
-    def do(self, work: str, unit: Any) -> tuple[Counts, str]:
-        """One unit of work: what was computed for it, or the line that says why not."""
+    def do(self, task: str, item: Any) -> tuple[Counts, str]:
+        """Compute one item: its counts, and an error message that is empty on success."""
         assert self.graph is not None
         try:
-            return self.graph.do(work, unit), ""
+            return self.graph.do(task, item), ""
         except DzopError as error:
             return {}, str(error)
 
 
-def _site_of(run: Context, runtime: Runtime, threads: int) -> dict[str, Any]:
-    """All that a worker builds the run's graph from."""
-    plain = Runtime(**{f.name: getattr(runtime, f.name) for f in fields(Runtime)})
+def _worker_setup(run: Context, runtime: RayRuntime, threads: int) -> dict[str, Any]:
+    """Arguments of ``_build_graph`` that are sent to a worker."""
+    local = Runtime(**{f.name: getattr(runtime, f.name) for f in fields(Runtime)})
     return {
         "run": (run.stages, run.dataset, run.targets, run.store.config),
-        "runtime": replace(plain, progress=False),
-        "threads": threads or getattr(runtime, "cpus_per_actor", 1),
+        "runtime": replace(local, progress=False),
+        "threads": threads or runtime.cpus_per_actor,
         "folder": os.getcwd(),
     }
 
 
-def _graph_of(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str) -> Graph:
+def _build_graph(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str) -> Graph:
     if os.path.isdir(folder):
         os.chdir(folder)  # paths in the configuration may be relative
     use_threads(threads)
@@ -218,33 +247,36 @@ def _graph_of(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str)
     return graph
 
 
+# --- connecting -------------------------------------------------------------------------------------------------------
+
+
 def _connect(address: str) -> None:
-    """Join a cluster, or make one of this machine: no dashboard, no usage report, its ports guarded by a token."""
+    """Join a cluster, or start a local one without dashboard and usage reports. Raises BadInput if that fails."""
     if ray.is_initialized():
         return
     _check_reachable(address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    chosen: dict[str, Any] = {"address": address}
+    options: dict[str, Any] = {"address": address}
     if address == "local":
-        chosen |= {"include_dashboard": False, "object_store_memory": _STORE_BYTES}
+        options |= {"include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES}
     try:
-        ray.init(**chosen, log_to_driver=False, logging_level=logging.ERROR)
-    except Exception as error:  # Ray raises bare ones where a node does not start in time
-        raise BadInput("runtime.address", found=f"{address} ({_brief(error)})", needed=_ADDRESSES) from None
+        ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
+    except Exception as error:  # Ray raises a plain Exception when a node does not start in time
+        raise BadInput("runtime.address", found=f"{address} ({_first_line(error)})", needed=_ADDRESSES) from None
 
 
 def _check_reachable(address: str) -> None:
-    """Raise BadInput at once where nobody listens, for which Ray takes minutes."""
+    """Raise BadInput if nothing listens at the address; Ray itself would take minutes to fail."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not colon:
         return
     try:
-        socket.create_connection((host, int(port)), timeout=_REACH_S).close()
+        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
     except (OSError, ValueError, OverflowError) as error:
         raise BadInput("runtime.address", found=f"{address} ({error})", needed=_ADDRESSES) from None
 
 
-def _brief(error: BaseException) -> str:
-    """The first line of what Ray says, which is often a page."""
+def _first_line(error: BaseException) -> str:
+    """First line of an error message; Ray's often fill a page."""
     text = str(error).strip()
     return text.splitlines()[0].strip() if text else type(error).__name__

@@ -1,4 +1,4 @@
-"""Work on a Ray cluster: the same bytes as in one process, whoever dies; and one line for what cannot be."""
+"""A run on a Ray cluster: the same bytes as in one process, even if workers die; setup errors take one line."""
 
 import os
 import signal
@@ -41,15 +41,15 @@ def local(scene, tmp_path_factory) -> Path:
 
 
 class TwoNodes:
-    """A cluster of two nodes on this machine, of one core each, and the workers of each."""
+    """A cluster of two nodes on this machine, with one core each."""
 
     def __init__(self, cluster_type: type) -> None:
         small = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80_000_000}
         self.cluster = cluster_type(initialize_head=True, head_node_args=small)
         self.second = self.cluster.add_node(**small)
 
-    def at_work(self) -> psutil.Process | None:
-        """A worker of the second node that is doing a unit of work."""
+    def busy_worker(self) -> psutil.Process | None:
+        """A worker of the second node that is computing an item."""
         raylet = psutil.Process(self.second.all_processes["raylet"][0].process.pid)
         for process in raylet.children():
             if "ray::Worker.do" in " ".join(process.cmdline()):
@@ -66,7 +66,7 @@ def nodes() -> Iterator[TwoNodes]:
 
 
 def _start(cluster_type: type) -> TwoNodes:
-    """Ray gives a node 30 s to start, which a machine that is busy with other tests may not keep."""
+    """Retry: Ray gives a node 30 s to start, which may be too short on a machine that runs other tests."""
     for _ in range(3):
         try:
             return TwoNodes(cluster_type)
@@ -77,13 +77,13 @@ def _start(cluster_type: type) -> TwoNodes:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dies", ["worker", "node"])
-def test_two_nodes_of_which_one_loses_its_worker_leave_the_bytes_of_one_process(scene, local, tmp_path, nodes, dies):
+def test_two_nodes_that_lose_a_worker_write_the_same_bytes_as_one_process(scene, local, tmp_path, nodes, dies):
     where = ("runtime=ray", f"runtime.address={nodes.cluster.address}", "runtime.actors=2")
     run = subprocess.Popen(
         command(scene, tmp_path, *where), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     limit = time.monotonic() + 120
-    while (worker := nodes.at_work()) is None and run.poll() is None and time.monotonic() < limit:
+    while (worker := nodes.busy_worker()) is None and run.poll() is None and time.monotonic() < limit:
         time.sleep(0.01)
     assert worker is not None, run.communicate()
     time.sleep(0.1)
@@ -91,9 +91,9 @@ def test_two_nodes_of_which_one_loses_its_worker_leave_the_bytes_of_one_process(
         os.kill(worker.pid, signal.SIGKILL)
     else:
         nodes.cluster.remove_node(nodes.second, allow_graceful=False)
-    _, told = run.communicate(timeout=300)
-    assert run.returncode == 0, told
-    assert "its worker was lost; another goes on with it" in told
+    _, stderr = run.communicate(timeout=300)
+    assert run.returncode == 0, stderr
+    assert "its worker was lost; retrying on another" in stderr
     assert poses(tmp_path / "results") == poses(local / "results")
     ours, theirs = (contents(Store(LocalStoreConfig(root=str(folder / "cache")))) for folder in (tmp_path, local))
     assert set(ours) == set(theirs)
@@ -104,20 +104,23 @@ def test_two_nodes_of_which_one_loses_its_worker_leave_the_bytes_of_one_process(
 
 
 def _table(printed: str) -> list[str]:
-    """Lines of the summary between its head and its last."""
+    """Lines of the step table, without its header and total."""
     lines = printed.splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("step "))
     return [line for line in lines[first + 1 :] if line and not line.startswith("whole run")]
 
 
-def test_without_ray_one_line_says_how_to_have_it(scene, tmp_path, capsys, monkeypatch):
+def test_without_ray_the_message_says_how_to_install_it(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pipeline.ray_workers.ray", None)
     ran = run_dzop(capsys, monkeypatch, *command(scene, tmp_path, "runtime=ray")[3:])
-    assert (ran.status, ran.err) == (1, "error: runtime: found ray without Ray, needs pip install 'dzop[ray]'")
+    assert (ran.status, ran.err) == (
+        1,
+        "error: runtime: found ray, which is not installed, needs pip install 'dzop[ray]'",
+    )
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         (("store=memory",), "store: found memory with runtime=ray, needs a store that workers share"),
         (("runtime.actors=-1",), "runtime.actors: found -1, needs greater than or equal to 0"),
@@ -126,11 +129,13 @@ def test_without_ray_one_line_says_how_to_have_it(scene, tmp_path, capsys, monke
         (("runtime.device=tpu",), "runtime.device: found 'tpu', needs auto, cpu, cuda or cuda:N"),
     ],
 )
-def test_what_no_cluster_can_do_is_said_before_one_is_started(scene, tmp_path, capsys, monkeypatch, overrides, told):
+def test_impossible_settings_are_reported_before_a_cluster_is_started(
+    scene, tmp_path, capsys, monkeypatch, overrides, message
+):
     pytest.importorskip("ray", reason="needs Ray: pip install 'dzop[ray]'")
     unwanted = "store.root" if "store=memory" in overrides else "nothing"
     arguments = [word for word in command(scene, tmp_path, "runtime=ray")[3:] if unwanted not in word]
     ran = run_dzop(capsys, monkeypatch, *arguments, *overrides)
     assert ran.status == 1
-    assert ran.err.startswith(f"error: {told}")
+    assert ran.err.startswith(f"error: {message}")
     assert len(ran.err.splitlines()) == 1
