@@ -1,4 +1,9 @@
-"""Fixtures every test may use. Shapes in annotations are checked while tests run."""
+"""Fixtures every test may use. Shapes in annotations are checked while tests run.
+
+Tests on photographs read BOP datasets (``lmo/`` and ``ycbv/``) below the folder that the environment variable
+DZOP_TEST_DATA names; without it, below ``../shared/bop_mini`` beside the checkout. Values of other implementations are
+read from the folder ``reference`` next to it. Tests whose data are missing are skipped and say so.
+"""
 
 import os
 import shutil
@@ -13,7 +18,8 @@ os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 install_import_hook(["pipeline.functional"], "beartype.beartype")
 torch.set_num_threads(int(os.environ.get("DZOP_TEST_THREADS", "2")))
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
+ROOT = Path(__file__).resolve().parents[1]
+TEST_DATA = Path(os.environ.get("DZOP_TEST_DATA") or ROOT.parent / "shared" / "bop_mini").absolute()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -26,23 +32,22 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             terminalreporter.write_line(line)
 
 
-def _shared(*parts: str) -> Path:
-    path = SHARED.joinpath(*parts)
+def _existing(path: Path) -> Path:
     if not path.exists():
-        pytest.skip(f"needs the photographs and values of ../shared/{'/'.join(parts)}, which only the developers have")
+        pytest.skip(f"no test data: found no folder {path}, needs DZOP_TEST_DATA=path/to/bop_mini")
     return path
 
 
 @pytest.fixture(scope="session")
 def bop_mini() -> Path:
     """Real photographs, meshes and ground truth in BOP format: lmo/ and ycbv/."""
-    return _shared("bop_mini")
+    return _existing(TEST_DATA)
 
 
 @pytest.fixture(scope="session")
 def bop_reference() -> Path:
     """bop_toolkit's own values of the pose errors."""
-    return _shared("reference", "bop_metrics")
+    return _existing(TEST_DATA.parent / "reference" / "bop_metrics")
 
 
 @pytest.fixture(scope="module")
