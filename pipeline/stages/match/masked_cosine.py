@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional.masks import cell_mask
-from pipeline.functional.similarity import cell_cosine, sum_over_count
+from pipeline.functional.similarity import cell_cosine, masked_mean
 from pipeline.items.matches import TemplateMatch
 from pipeline.spec import NonNegative, Positive, Spec, spec
 from pipeline.stages.match import ranked
@@ -50,4 +50,4 @@ class MaskedCosine(Spec):
             "union": of_query | of_bank,
         }[self.normalise]
         similarity = cell_cosine(query, bank)
-        return ranked(sum_over_count(similarity, of_query & of_bank, over=over.sum((1, 2)).float()), top_k=self.top_k)
+        return ranked(masked_mean(similarity, of_query & of_bank, count=over.sum((1, 2)).float()), top_k=self.top_k)
