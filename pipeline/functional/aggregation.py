@@ -1,4 +1,4 @@
-"""Feature maps of several layers -> one descriptor for each cell, by a small trained network."""
+"""Feature maps of several layers -> one descriptor per cell, by a small trained network."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch.nn.functional import gelu, interpolate, pixel_shuffle
 
 
 class Aggregation(nn.Module):
-    """Each layer scaled to cells of unit mean square, mixed by its own matrix, upsampled and added; then one MLP.
+    """Layer aggregation: normalise each cell, project each layer linearly, upsample, add, then one residual MLP.
 
-    Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023, with one timestep and a matrix for a bottleneck of each layer.
-    Then every cell becomes 2x2: what a cell holds of its own inside is learned as a difference to plain interpolation
-    (sub-pixel convolution: Shi et al., CVPR 2016).
+    Follows Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023, with one timestep and one matrix per layer instead of
+    a bottleneck. The output is upsampled by 2 with a sub-pixel convolution (Shi et al., CVPR 2016) that learns the
+    residual to bilinear interpolation. ``channels``: layer -> its number of channels; ``dim``: channels of the output.
     """
 
     def __init__(self, channels: Mapping[int, int], dim: int) -> None:
@@ -27,14 +27,15 @@ class Aggregation(nn.Module):
         self.split = nn.Conv2d(dim, 4 * dim, 3, padding=1)
 
     def forward(self, maps: Mapping[int, Float[Tensor, "n _c _h _w"]]) -> Float[Tensor, "n d H W"]:
-        """Descriptors at twice the resolution of the finest layer; their lengths mean nothing."""
+        """Descriptors at twice the resolution of the finest layer, not normalised."""
         cells = max(maps[layer].shape[-1] for layer in self.layers)
-        total = self._mixed(maps, self.layers, cells)
+        total = self._mix_layers(maps, self.layers, cells)
         total = total + self.narrow(gelu(self.widen(total)))
         smooth = interpolate(total, scale_factor=2, mode="bilinear", align_corners=False)
         return smooth + pixel_shuffle(self.split(gelu(total)), 2)
 
-    def _mixed(self, maps: Mapping[int, Tensor], layers: Sequence[int], cells: int) -> Tensor:
+    def _mix_layers(self, maps: Mapping[int, Tensor], layers: Sequence[int], cells: int) -> Tensor:
+        """Sum of the projected layers at ``cells`` x ``cells``."""
         total: Tensor | None = None
         for layer, mix in zip(layers, self.mix, strict=True):
             x = maps[layer]

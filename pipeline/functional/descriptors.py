@@ -1,4 +1,4 @@
-"""One vector for a whole crop, and how much it looks like an object known by many templates."""
+"""One descriptor per crop, and its similarity to an object with many templates."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pipeline.functional.similarity import l2_normalize
 
 
 def pool_foreground(maps: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n S S"]) -> Float[Tensor, "n c"]:
-    """Mean feature of each crop's foreground cells; of a map of one cell, as a class token is, that cell.
+    """Mean feature over each crop's foreground cells; zeros for a crop with an empty mask.
 
-    Zeros for a crop without a pixel of mask.
+    A map of one cell, such as a class token, is returned as that cell.
     """
     inside = cell_mask(mask, cells=maps.shape[-1]).float()
     total = torch.einsum("nchw,nhw->nc", maps.float(), inside)
@@ -21,9 +21,9 @@ def pool_foreground(maps: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n S S"])
 
 
 def mean_top_cosine(query: Float[Tensor, "p c"], templates: Float[Tensor, "n c"], *, best: int) -> Float[Tensor, " p"]:
-    """Mean of each query's ``best`` highest cosines with the templates, of all where there are fewer.
+    """Mean of each query's ``best`` highest cosines with the templates (of all if there are fewer).
 
-    Negative cosines count as 0. Nguyen et al., ICCVW 2023, "CNOS", section 3.3, with ``best`` 5.
+    Negative cosines count as 0. Source: Nguyen et al., "CNOS", ICCVW 2023, section 3.3, with ``best`` = 5.
     """
     cosine = (l2_normalize(query) @ l2_normalize(templates).T).clamp(0, 1)
     return cosine.topk(min(best, len(templates)), dim=1).values.mean(1)

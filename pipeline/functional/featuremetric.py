@@ -1,11 +1,11 @@
-"""A pose from feature maps without matching: object points whose descriptors the query ought to show where they land.
+"""Featuremetric pose refinement: move object points until the query shows their descriptors where they project.
 
-A query's map is read in between cells, bilinear, at positions (x, y) in cells. Points that land outside the map,
-outside its mask or behind the camera read nothing. Residuals need inner products alone, and those of a map with itself
-are the same in every step, so that a step costs one product of each point's descriptor with the four cells around it.
+The query's map is sampled bilinearly at positions (x, y) in cells. Points that project outside the map, outside its
+mask or behind the camera have no sample. Residuals are computed from inner products only; those of the map with itself
+are precomputed, so a step costs one product of each point's descriptor with the four cells around it.
 
-An increment xi = (v, omega) turns about the points' centre c in the camera frame: p -> c + exp(omega) (p - c) + v, a
-left multiplication of T_cam_obj that does not mix turning with shifting.
+An increment xi = (v, omega), in mm and radians, rotates about the points' centroid c in the camera frame: p -> c +
+exp(omega) (p - c) + v. It multiplies T_cam_obj from the left and keeps rotation and translation decoupled.
 """
 
 from __future__ import annotations
@@ -18,86 +18,90 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.functional.rigid import nearest_rotation, rigid, transform
 
-_FILL_CELLS = 0.7  # blur that carries the foreground's descriptors over its edge
-_DAMPING = (1e-7, 1e-3, 1e6)  # least, first, and where no step is left
-_FALL = 1e-4  # relative fall of the cost that is not worth another step
-_FLOOR = 0.05  # least scale, in lengths of a descriptor: residuals of an exact fit are rounding
+_FILL_SIGMA_CELLS = 0.7  # blur that extends the foreground's descriptors beyond its edge
+_MIN_DAMPING, _FIRST_DAMPING, _MAX_DAMPING = 1e-7, 1e-3, 1e6
+_MIN_DECREASE = 1e-4  # stop when a step promises less than this relative decrease of the cost
+_MIN_SCALE = 0.05  # of the descriptors' length: residuals of an exact fit are rounding errors
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row, column
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureField:
-    """A query's descriptors by squares of four neighbouring cells' centres, in reading order of the upper left one.
+    """A query's descriptors, prepared for bilinear sampling. n squares of four neighbouring cells, in row-major order.
 
-    ``gram``: inner products of the four. ``directions``: a descriptor read counts as if it were of unit length.
+    ``corners``: descriptors of the four cells; ``gram``: their inner products. ``mask``: foreground cells.
+    ``normalize``: scale each sampled descriptor to unit length.
     """
 
     corners: Float32[np.ndarray, "n 4 c"]
     gram: Float32[np.ndarray, "n 4 4"]
     mask: Bool[np.ndarray, "h w"]
-    directions: bool
+    normalize: bool
 
     @classmethod
     def from_map(
-        cls, values: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, directions: bool = False
+        cls, values: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, normalize: bool = False
     ) -> FeatureField:
-        """The field of a map."""
+        """The field of a feature map and its foreground."""
         h, w, c = values.shape
         four = [values[i : h - 1 + i, j : w - 1 + j] for i, j in _CORNERS]
         corners = np.stack(four, axis=2).reshape(-1, 4, c)
-        return cls(corners, np.matmul(corners, corners.swapaxes(1, 2)), mask, directions)
+        return cls(corners, np.matmul(corners, corners.swapaxes(1, 2)), mask, normalize)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Object points (mm), the descriptor of each, and its mean squared residual to the query's foreground cells."""
+    """Object points (mm) with descriptors.
+
+    ``unobserved``: the squared residual of a point without a sample: its mean over the query's foreground cells.
+    """
 
     points_obj: Float[np.ndarray, "m 3"]
     descriptors: Float32[np.ndarray, "m c"]
-    unseen: Float[np.ndarray, " m"]
+    unobserved: Float[np.ndarray, " m"]
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Of points that read a field: squared residuals, half their gradient by (x, y) and Gauss-Newton's half Hessian."""
+    """Squared residuals of sampled points, with half their gradient and half their Gauss-Newton Hessian by (x, y)."""
 
     squared: Float[np.ndarray, " m"]
-    pull: Float[np.ndarray, "m 2"]
-    curve: Float[np.ndarray, "m 2 2"]
+    half_gradient: Float[np.ndarray, "m 2"]
+    half_hessian: Float[np.ndarray, "m 2 2"]
 
 
 @dataclass(frozen=True, eq=False)
 class RobustLoss:
-    """The loss of Barron, CVPR 2019, Eq. 9, of a squared residual over ``scale`` squared; ``alpha`` below 2.
+    """The general robust loss of Barron, CVPR 2019, Eq. 9, for ``alpha`` < 2.
 
-    0: Cauchy; -2: Geman-McClure. Smaller: sooner indifferent to how far off an outlier is.
+    ``alpha`` 0: Cauchy; -2: Geman-McClure; smaller values saturate earlier. ``scale``: residual at which it bends.
     """
 
     alpha: float
     scale: float
 
     def cost(self, squared: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Loss of each residual; 0 for none, and half of squared / scale^2 for small ones."""
-        x, bend = squared / self.scale**2, 2.0 - self.alpha
+        """Loss of squared residuals; about squared / (2 scale^2) for small ones."""
+        x, b = squared / self.scale**2, 2.0 - self.alpha
         if self.alpha == 0:
             return np.log1p(x / 2)
-        return bend / self.alpha * ((x / bend + 1) ** (self.alpha / 2) - 1)
+        return b / self.alpha * ((x / b + 1) ** (self.alpha / 2) - 1)
 
     def weight(self, squared: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Twice the derivative of the loss by ``squared``: what reweighted least squares multiply residuals with."""
-        x, bend = squared / self.scale**2, 2.0 - self.alpha
-        return (x / bend + 1) ** (self.alpha / 2 - 1) / self.scale**2
+        """Weights of iteratively reweighted least squares: twice the derivative of the loss by ``squared``."""
+        x, b = squared / self.scale**2, 2.0 - self.alpha
+        return (x / b + 1) ** (self.alpha / 2 - 1) / self.scale**2
 
 
 def smooth_foreground(
     features: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, sigma_cells: float
 ) -> Float32[np.ndarray, "h w c"]:
-    """Gaussian mean over the foreground alone, at foreground cells and behind their edge; 0 far from any.
+    """Feature map blurred with a Gaussian over foreground cells only, and extended beyond the foreground's edge.
 
-    ``sigma_cells`` 0: the foreground as it is.
+    ``sigma_cells`` 0: foreground cells stay unchanged. Cells far from the foreground are 0.
     """
-    sigma = sigma_cells or _FILL_CELLS
-    rows, columns = (_gaussian(n, sigma) for n in mask.shape)
+    sigma = sigma_cells or _FILL_SIGMA_CELLS
+    rows, columns = (_gaussian_matrix(n, sigma) for n in mask.shape)
     weight = rows @ mask.astype(np.float32) @ columns
     total = np.tensordot(rows, features * mask[..., None], axes=1)
     total = np.matmul(columns, total)
@@ -105,52 +109,56 @@ def smooth_foreground(
     return mean if sigma_cells else np.where(mask[..., None], features, mean)
 
 
-def _gaussian(n: int, sigma: float) -> Float32[np.ndarray, "n n"]:
-    apart = np.arange(n)[:, None] - np.arange(n)
-    return np.exp(-0.5 * (apart / sigma) ** 2).astype(np.float32)
+def _gaussian_matrix(n: int, sigma: float) -> Float32[np.ndarray, "n n"]:
+    distance = np.arange(n)[:, None] - np.arange(n)
+    return np.exp(-0.5 * (distance / sigma) ** 2).astype(np.float32)
 
 
 def residuals_at(
     field: FeatureField, xy: Float[np.ndarray, "m 2"], descriptors: Float32[np.ndarray, "m c"]
 ) -> Residuals:
-    """What is read at positions inside the map, minus the descriptors that ought to be there. Per cell."""
+    """Residuals F(x, y) - d between the field at positions inside the map and the points' descriptors.
+
+    Derivatives are per cell. With weights W (value, d/dx and d/dy of bilinear interpolation) over the four corner
+    descriptors C, f = W C, so the products f f^T = W (C C^T) W^T and f d = W (C d) suffice.
+    """
     h, w = field.mask.shape
     corner = np.clip(np.floor(xy).astype(np.int64), 0, (w - 2, h - 2))
     a, b = (xy - corner).T
     square = corner[:, 1] * (w - 1) + corner[:, 0]
     value = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
     by_x, by_y = [b - 1, 1 - b, -b, b], [a - 1, -a, 1 - a, a]
-    weights = np.stack([np.stack(rows, axis=1) for rows in (value, by_x, by_y)], axis=1)
-    own = np.matmul(np.matmul(weights, field.gram[square]), weights.swapaxes(1, 2))
-    with_descriptor = np.matmul(field.corners[square], descriptors[:, :, None]).astype(np.float64)
-    cross = np.matmul(weights, with_descriptor)[:, :, 0]
-    power = np.square(descriptors, dtype=np.float64).sum(1)
-    if field.directions:
-        own, cross = _of_directions(own, cross)
-    squared = np.maximum(own[:, 0, 0] + power - 2 * cross[:, 0], 0)
-    return Residuals(squared, own[:, 0, 1:] - cross[:, 1:], own[:, 1:, 1:])
+    W = np.stack([np.stack(rows, axis=1) for rows in (value, by_x, by_y)], axis=1)
+    ff = np.matmul(np.matmul(W, field.gram[square]), W.swapaxes(1, 2))
+    Cd = np.matmul(field.corners[square], descriptors[:, :, None]).astype(np.float64)
+    fd = np.matmul(W, Cd)[:, :, 0]
+    dd = np.square(descriptors, dtype=np.float64).sum(1)
+    if field.normalize:
+        ff, fd = _normalize_products(ff, fd)
+    squared = np.maximum(ff[:, 0, 0] + dd - 2 * fd[:, 0], 0)
+    return Residuals(squared, ff[:, 0, 1:] - fd[:, 1:], ff[:, 1:, 1:])
 
 
-def _of_directions(
-    own: Float[np.ndarray, "m 3 3"], cross: Float[np.ndarray, "m 3"]
+def _normalize_products(
+    ff: Float[np.ndarray, "m 3 3"], fd: Float[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]]:
-    """Inner products of f / |f| and its derivatives, from those of f and its own: the part along f drops out."""
-    power = np.maximum(own[:, 0, 0], np.finfo(np.float32).tiny)
-    length, along = np.sqrt(power), own[:, 0, 1:] / power[:, None]
-    turned = np.zeros_like(own)
-    turned[:, 0, 0] = 1
-    turned[:, 1:, 1:] = own[:, 1:, 1:] / power[:, None, None] - along[:, :, None] * along[:, None]
-    seen = cross / length[:, None]
-    seen[:, 1:] -= seen[:, :1] * along
-    return turned, seen
+    """The same products for f / |f| in place of f: its derivatives lose their component along f."""
+    power = np.maximum(ff[:, 0, 0], np.finfo(np.float32).tiny)
+    length, along = np.sqrt(power), ff[:, 0, 1:] / power[:, None]
+    unit_ff = np.zeros_like(ff)
+    unit_ff[:, 0, 0] = 1
+    unit_ff[:, 1:, 1:] = ff[:, 1:, 1:] / power[:, None, None] - along[:, :, None] * along[:, None]
+    unit_fd = fd / length[:, None]
+    unit_fd[:, 1:] -= unit_fd[:, :1] * along
+    return unit_ff, unit_fd
 
 
 def project_cells(
     K_cell: Float[np.ndarray, "3 3"], points_cam: Float[np.ndarray, "m 3"], centre_cam: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2 6"]]:
-    """Positions in cells, and their derivatives by the increment; NaN for points that are not in front.
+    """Positions (x, y) in cells and their derivatives by the increment xi; NaN for points behind the camera.
 
-    ``K_cell`` takes camera to cells: any 3 x 3 matrix, the camera's own times an affine map or a homography of planes.
+    ``K_cell`` projects the camera frame to cells: the camera matrix followed by an affine map or a homography.
     """
     front = (points_cam[:, 2] > 0) & (points_cam @ K_cell[2] > 0)
     p = np.where(front[:, None], points_cam, np.nan)
@@ -164,25 +172,25 @@ def project_cells(
 def apply_increment(
     T_cam_obj: Float[np.ndarray, "4 4"], centre_cam: Float[np.ndarray, " 3"], xi: Float[np.ndarray, " 6"]
 ) -> Float[np.ndarray, "4 4"]:
-    """The pose after an increment about a point of the camera frame."""
-    turn = cv2.Rodrigues(xi[3:])[0]
-    R = nearest_rotation(turn @ T_cam_obj[:3, :3])
-    return rigid(R, turn @ (T_cam_obj[:3, 3] - centre_cam) + centre_cam + xi[:3])
+    """T_cam_obj after the increment xi = (v in mm, omega in radians) about ``centre_cam`` (camera frame, mm)."""
+    R_increment = cv2.Rodrigues(xi[3:])[0]
+    R = nearest_rotation(R_increment @ T_cam_obj[:3, :3])
+    return rigid(R, R_increment @ (T_cam_obj[:3, 3] - centre_cam) + centre_cam + xi[:3])
 
 
 def squared_residuals(
     surface: Surface, field: FeatureField, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Squared residual of every point, and which points read the query: the others have their ``unseen``."""
+    """Squared residual of every point (``unobserved`` where there is no sample), and which points have a sample."""
     xy, _ = project_cells(K_cell, transform(T_cam_obj, surface.points_obj), np.zeros(3))
-    seen = in_foreground(field, xy)
-    squared = surface.unseen.copy()
-    squared[seen] = residuals_at(field, xy[seen], surface.descriptors[seen]).squared
-    return squared, seen
+    observed = in_foreground(field, xy)
+    squared = surface.unobserved.copy()
+    squared[observed] = residuals_at(field, xy[observed], surface.descriptors[observed]).squared
+    return squared, observed
 
 
 def in_foreground(field: FeatureField, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
-    """Which positions lie in a foreground cell, between centres of cells."""
+    """Which positions lie in a foreground cell and inside the grid of cell centres."""
     h, w = field.mask.shape
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((xy >= 0) & (xy <= (w - 1, h - 1))).all(1))
@@ -197,24 +205,23 @@ def normal_equations(
     T_cam_obj: Float[np.ndarray, "4 4"],
     robust: RobustLoss,
 ) -> tuple[float, Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"], Float[np.ndarray, " 3"]]:
-    """Mean robust cost over all points, Gauss-Newton's matrix and gradient of it, and the increment's centre.
+    """Mean robust cost over all points, its Gauss-Newton matrix and gradient by xi, and the increment's centre (mm).
 
-    A point that reads nothing costs what its residual to a mean cell of the query costs, so that no pose gains by
-    moving points out of sight.
+    A point without a sample costs its ``unobserved`` residual, so that no pose gains by moving points out of sight.
     """
     points_cam = transform(T_cam_obj, surface.points_obj)
     centre = points_cam.mean(0)
     xy, by_xi = project_cells(K_cell, points_cam, centre)
-    seen = in_foreground(field, xy)
-    found = residuals_at(field, xy[seen], surface.descriptors[seen])
-    squared = surface.unseen.copy()
-    squared[seen] = found.squared
-    weight = robust.weight(found.squared) / len(squared)
-    by_xi = by_xi[seen]
-    pull = (found.pull * weight[:, None]).reshape(-1)
-    curve = np.matmul(found.curve * weight[:, None, None], by_xi).reshape(-1, 6)
+    observed = in_foreground(field, xy)
+    residuals = residuals_at(field, xy[observed], surface.descriptors[observed])
+    squared = surface.unobserved.copy()
+    squared[observed] = residuals.squared
+    weight = robust.weight(residuals.squared) / len(squared)
+    by_xi = by_xi[observed]
+    gradient_xy = (residuals.half_gradient * weight[:, None]).reshape(-1)
+    hessian_J = np.matmul(residuals.half_hessian * weight[:, None, None], by_xi).reshape(-1, 6)
     J = by_xi.reshape(-1, 6)
-    return float(robust.cost(squared).mean()), J.T @ curve, J.T @ pull, centre
+    return float(robust.cost(squared).mean()), J.T @ hessian_J, J.T @ gradient_xy, centre
 
 
 def descend(
@@ -226,24 +233,24 @@ def descend(
     *,
     iterations: int,
 ) -> Float[np.ndarray, "4 4"]:
-    """The pose after at most that many steps of Levenberg-Marquardt; each step taken lowers the mean robust cost.
+    """T_cam_obj after at most ``iterations`` Levenberg-Marquardt steps; only steps that lower the mean cost are taken.
 
-    Marquardt's damping: the matrix's own diagonal, ten times more of it after a step that did not help, ten times less
-    after one that did. Ends where the next step promises no fall that is worth it.
+    Marquardt's damping with the matrix's diagonal: times 10 after a rejected step, divided by 10 after an accepted
+    one. Stops when the next step promises too small a decrease.
     """
-    least, damping, most = _DAMPING
+    damping = _FIRST_DAMPING
     cost, H, g, centre = normal_equations(surface, field, K_cell, T_cam_obj, robust)
     for _ in range(iterations):
         diagonal = np.diag(H)
-        if damping > most or not diagonal.min() > 0:
+        if damping > _MAX_DAMPING or not diagonal.min() > 0:
             break
         step = np.linalg.solve(H + damping * np.diag(diagonal), -g)
-        if -(g + H @ step / 2) @ step < _FALL * cost:
+        if -(g + H @ step / 2) @ step < _MIN_DECREASE * cost:
             break
         T_next = apply_increment(T_cam_obj, centre, step)
         after = normal_equations(surface, field, K_cell, T_next, robust)
         if after[0] < cost:
-            T_cam_obj, (cost, H, g, centre), damping = T_next, after, max(damping / 10, least)
+            T_cam_obj, (cost, H, g, centre), damping = T_next, after, max(damping / 10, _MIN_DAMPING)
         else:
             damping *= 10
     return T_cam_obj
@@ -252,15 +259,15 @@ def descend(
 def robust_scale(
     surface: Surface, field: FeatureField, K_cell: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
 ) -> float:
-    """Median length of the residuals of the points that read the query; never below rounding of an exact fit."""
-    squared, seen = squared_residuals(surface, field, K_cell, T_cam_obj)
+    """Median residual length over points with a sample, bounded below so that it never reaches rounding errors."""
+    squared, observed = squared_residuals(surface, field, K_cell, T_cam_obj)
     length = float(np.sqrt(np.mean(np.square(surface.descriptors).sum(1))))
-    median = float(np.sqrt(np.median(squared[seen]))) if seen.any() else length
-    return max(median, _FLOOR * length, float(np.finfo(np.float32).tiny))
+    median = float(np.sqrt(np.median(squared[observed]))) if observed.any() else length
+    return max(median, _MIN_SCALE * length, float(np.finfo(np.float32).tiny))
 
 
 def l2_normalize(features: Float32[np.ndarray, "*n c"]) -> Float32[np.ndarray, "*n c"]:
-    """Descriptors of unit length; 0 stays 0."""
+    """Vectors scaled to length 1 along the last axis; zero vectors stay zero."""
     length = np.linalg.norm(features, axis=-1, keepdims=True)
     return features / np.where(length > 0, length, 1)
 
@@ -274,14 +281,17 @@ def build_level(
     points_obj: Float[np.ndarray, "m 3"],
     *,
     sigma_cells: float,
-    directions: bool,
+    normalize: bool,
 ) -> tuple[Surface, FeatureField]:
-    """Template cells (flat indices) with their points, and the query, both smoothed alike."""
-    shown = smooth_foreground(query, query_mask, sigma_cells=sigma_cells)
+    """One level of the coarse-to-fine refinement: the template's surface and the query's field, equally blurred.
+
+    ``cell``: flat indices of the template cells to use; ``points_obj``: their object points, mm.
+    """
+    F = smooth_foreground(query, query_mask, sigma_cells=sigma_cells)
     d = smooth_foreground(template, template_mask, sigma_cells=sigma_cells).reshape(-1, template.shape[-1])[cell]
-    if directions:
-        shown, d = l2_normalize(shown), l2_normalize(d)
-    inside = shown[query_mask]
-    unseen = np.square(d).sum(1) + np.square(inside).sum(1).mean() - 2 * d @ inside.mean(0)
-    surface = Surface(points_obj, d, np.maximum(unseen, 0).astype(np.float64))
-    return surface, FeatureField.from_map(shown, query_mask, directions=directions)
+    if normalize:
+        F, d = l2_normalize(F), l2_normalize(d)
+    inside = F[query_mask]
+    unobserved = np.square(d).sum(1) + np.square(inside).sum(1).mean() - 2 * d @ inside.mean(0)
+    surface = Surface(points_obj, d, np.maximum(unobserved, 0).astype(np.float64))
+    return surface, FeatureField.from_map(F, query_mask, normalize=normalize)

@@ -45,11 +45,11 @@ def oriented_energy(
     Central differences, no smoothing, of the colour channel with the strongest gradient (Dalal and Triggs, Sec. 6.2).
     """
     image = rgb.permute(0, 3, 1, 2).float()  # whole numbers: two channels that tie do so exactly
-    dx, dy = (_difference(image, axis=axis) for axis in (3, 2))
+    dx, dy = (_central_difference(image, axis=axis) for axis in (3, 2))
     length = torch.hypot(dx, dy)
     magnitude, strongest = length.max(dim=1, keepdim=True)
     dx, dy, magnitude = dx.gather(1, strongest)[:, 0], dy.gather(1, strongest)[:, 0], magnitude[:, 0]
-    magnitude = magnitude / 255 * torch.where(_at_border(mask), silhouette, 1.0)
+    magnitude = magnitude / 255 * torch.where(_crosses_border(mask), silhouette, 1.0)
     turn = 2 * math.pi if signed else math.pi
     place = torch.atan2(dy, dx).remainder(turn) * (orientations / turn)
     share = place.frac() * magnitude
@@ -93,14 +93,14 @@ def append_neighbours(
     return x.mul_((energy + contrast**2).rsqrt())
 
 
-def _difference(image: Float[Tensor, "n 3 S S"], *, axis: int) -> Float[Tensor, "n 3 S S"]:
+def _central_difference(image: Float[Tensor, "n 3 S S"], *, axis: int) -> Float[Tensor, "n 3 S S"]:
     sides = (1, 1, 0, 0) if axis == 3 else (0, 0, 1, 1)
     padded = pad(image, sides, mode="replicate")
     size = image.shape[axis]
     return (padded.narrow(axis, 2, size) - padded.narrow(axis, 0, size)) / 2
 
 
-def _at_border(mask: Bool[Tensor, "n S S"]) -> Bool[Tensor, "n S S"]:
+def _crosses_border(mask: Bool[Tensor, "n S S"]) -> Bool[Tensor, "n S S"]:
     """Pixels whose central difference crosses the mask's border."""
     m = pad(mask[:, None].float(), (1, 1, 1, 1), mode="replicate")[:, 0]
     cross = torch.stack([m[:, 1:-1, :-2], m[:, 1:-1, 2:], m[:, :-2, 1:-1], m[:, 2:, 1:-1], m[:, 1:-1, 1:-1]])

@@ -24,14 +24,14 @@ def kmeans(
     """
     x = points.cpu()
     centre = x[torch.from_numpy(kmeans_plus_plus(x.numpy(), count=count, seed=seed))]
-    label = _nearest_centre(x, centre)
+    label = _assign(x, centre)
     for _ in range(iterations):
-        centre = _means(x, label, centre)
-        before, label = label, _nearest_centre(x, centre)
+        centre = _update_centres(x, label, centre)
+        before, label = label, _assign(x, centre)
         if torch.equal(before, label):
             break
     used, label = label.unique(return_inverse=True)
-    return label.to(points.device), _means(x, label, centre[used]).to(points.device)
+    return label.to(points.device), _update_centres(x, label, centre[used]).to(points.device)
 
 
 def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -> Int[np.ndarray, " k"]:
@@ -55,13 +55,13 @@ def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: in
     return np.array(chosen)
 
 
-def _nearest_centre(x: Tensor, centre: Tensor) -> Tensor:
+def _assign(x: Tensor, centre: Tensor) -> Tensor:
     squared = (centre * centre).sum(1)
     distance = (torch.addmm(squared, rows, centre.T, alpha=-2) for rows in x.split(_BLOCK))
     return torch.cat([torch.from_numpy(d.numpy().argmin(1)) for d in distance])  # numpy's takes a sixth of torch's time
 
 
-def _means(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:
+def _update_centres(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:
     """Mean of each cluster's points; a cluster that lost all of them keeps its centre."""
     number = torch.bincount(label, minlength=len(centre))[:, None]
     total = torch.zeros_like(centre).index_add_(0, label, x)

@@ -21,11 +21,11 @@ def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Te
     mean = samples.mean(0)
     centred = samples - mean
     wide = centred.shape[0] < centred.shape[1]
-    variance, vectors = _leading(_gram(centred if wide else centred.T, exact=wide), dim)
+    variance, vectors = _leading_eigenvectors(_gram_matrix(centred if wide else centred.T, exact=wide), dim)
     leading = torch.from_numpy(vectors).to(samples.device, samples.dtype)
     if wide:
         leading = centred.T @ (leading / torch.from_numpy(variance).sqrt().to(leading))
-    return mean, _signed(leading)
+    return mean, _fix_signs(leading)
 
 
 def principal_axes_in_blocks(
@@ -41,9 +41,9 @@ def principal_axes_in_blocks(
     for part in blocks:
         centred = part.double() - mean
         gram += centred.T @ centred
-    _, vectors = _leading(gram.cpu().numpy(), dim)
+    _, vectors = _leading_eigenvectors(gram.cpu().numpy(), dim)
     axes = torch.from_numpy(vectors).to(samples.device, torch.float32)
-    return mean.float(), _signed(axes)
+    return mean.float(), _fix_signs(axes)
 
 
 def project_onto_axes(
@@ -54,7 +54,7 @@ def project_onto_axes(
     return torch.cat([part.float() @ axes - shift for part in samples.split(block)])
 
 
-def _gram(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
+def _gram_matrix(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
     """Products of all pairs of rows: numpy knows x x^T for what it is, and computes half of it.
 
     ``exact``, float64: for few samples, whose axes are sums of them over the root of their variance. Otherwise in the
@@ -67,7 +67,7 @@ def _gram(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
     return a @ a.T
 
 
-def _leading(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
+def _leading_eigenvectors(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
     size = len(gram)
     values, vectors = scipy.linalg.eigh(gram, subset_by_index=[max(0, size - dim), size - 1], driver="evr")
     values, vectors = values[::-1].copy(), vectors[:, ::-1].copy()
@@ -75,7 +75,7 @@ def _leading(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
     return values[keep], vectors[:, keep]
 
 
-def _signed(axes: Float[Tensor, "c k"]) -> Float[Tensor, "c k"]:
+def _fix_signs(axes: Float[Tensor, "c k"]) -> Float[Tensor, "c k"]:
     if axes.shape[1] == 0:
         return axes
     largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))

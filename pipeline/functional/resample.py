@@ -21,9 +21,9 @@ def resample(
     Enlarged: bilinear. Shrunk: the mean over the area that the crop's pixel covers; both agree at scale 1.
     """
     height, width = image.shape[:2]
-    wy = _weights(height, size=size, scale=A_crop_img[1, 1], shift=A_crop_img[1, 2])
-    wx = _weights(width, size=size, scale=A_crop_img[0, 0], shift=A_crop_img[0, 2])
-    rows, columns = _used(wy), _used(wx)
+    wy = _axis_weights(height, size=size, scale=A_crop_img[1, 1], shift=A_crop_img[1, 2])
+    wx = _axis_weights(width, size=size, scale=A_crop_img[0, 0], shift=A_crop_img[0, 2])
+    rows, columns = _nonzero_columns(wy), _nonzero_columns(wx)
     part = image[rows, columns].astype(np.float32)
     lines = np.tensordot(wy[:, rows], part, axes=(1, 0))
     return np.moveaxis(np.tensordot(wx[:, columns], lines, axes=(1, 1)), 0, 1)
@@ -62,7 +62,7 @@ def _bilinear(pixels: Float[np.ndarray, "rows columns c"], px: Float[np.ndarray,
     return upper + y * (lower - upper)
 
 
-def _weights(pixels: int, *, size: int, scale: float, shift: float) -> Float[np.ndarray, "size pixels"]:
+def _axis_weights(pixels: int, *, size: int, scale: float, shift: float) -> Float[np.ndarray, "size pixels"]:
     """What each image pixel of an axis gives to each crop pixel."""
     centre = ((np.arange(size) - shift) / scale)[:, None]
     pixel = np.arange(pixels)
@@ -73,6 +73,6 @@ def _weights(pixels: int, *, size: int, scale: float, shift: float) -> Float[np.
     return (np.clip(overlap, 0, None) * scale).astype(np.float32)
 
 
-def _used(weights: Float[np.ndarray, "size pixels"]) -> slice:
+def _nonzero_columns(weights: Float[np.ndarray, "size pixels"]) -> slice:
     index = np.flatnonzero(weights.any(0))
     return slice(int(index[0]), int(index[-1]) + 1) if len(index) else slice(0, 0)

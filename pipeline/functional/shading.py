@@ -25,13 +25,13 @@ def corner_normals(
     it), weighted by the angle that each has there (Thürmer, Wüthrich, JGT 1998), so that the diagonals of a quad do
     not matter. 0 degrees give flat shading, 180 smooth throughout; a box needs less than 45.
     """
-    flat = _unit(face_normals(vertices, faces))
+    flat = _normalize(face_normals(vertices, faces))
     _, position = np.unique(vertices, axis=0, return_inverse=True)
     corner = position.reshape(-1)[faces]
     weights = (corner_angles(vertices, faces)[..., None] * flat[:, None]).reshape(-1, 3)
     count = int(corner.max()) + 1
     smooth = np.stack([np.bincount(corner.reshape(-1), weights[:, axis], count) for axis in range(3)], axis=-1)
-    at_corner, own = _unit(smooth)[corner], flat[:, None]
+    at_corner, own = _normalize(smooth)[corner], flat[:, None]
     agree = (at_corner * own).sum(-1, keepdims=True) >= np.cos(np.radians(crease_deg))
     return np.where(agree & (crease_deg > 0), at_corner, own)
 
@@ -39,11 +39,11 @@ def corner_normals(
 def corner_angles(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Angles of each face at its corners, radians."""
     corner = vertices[faces]
-    onward, back = _unit(np.roll(corner, -1, axis=1) - corner), _unit(np.roll(corner, 1, axis=1) - corner)
+    onward, back = _normalize(np.roll(corner, -1, axis=1) - corner), _normalize(np.roll(corner, 1, axis=1) - corner)
     return np.arccos(np.clip((onward * back).sum(-1), -1, 1))
 
 
-def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def _normalize(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
@@ -105,14 +105,14 @@ def _bilinear(image: UInt8[np.ndarray, "h w 3"], uv: Float[np.ndarray, "n 2"]) -
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = (x - x0).astype(np.float32)[:, None], (y - y0).astype(np.float32)[:, None]
-    left, right = _wrapped(x0, w)
-    top_row, bottom_row = (row * w for row in _wrapped(y0, h))
+    left, right = _wrap(x0, w)
+    top_row, bottom_row = (row * w for row in _wrap(y0, h))
     upper = texels.take(top_row + left, axis=0) * (1 - fx) + texels.take(top_row + right, axis=0) * fx
     lower = texels.take(bottom_row + left, axis=0) * (1 - fx) + texels.take(bottom_row + right, axis=0) * fx
     return upper * (1 - fy) + lower * fy
 
 
-def _wrapped(low: Float[np.ndarray, " n"], size: int) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+def _wrap(low: Float[np.ndarray, " n"], size: int) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Indices and those after them, beyond the border from the start again."""
     first = low.astype(np.int64)
     if len(first) and (first.min() < 0 or first.max() >= size):

@@ -22,7 +22,7 @@ def neighbourhood_shift(
     mask count. Departure: the shift that the template cell's own feature would get, which ought to be 0, is
     subtracted. Without it silhouettes pull inwards, and a perfect match moves by a tenth of a cell.
     """
-    offset, index, counts = _neighbours(mask, cell, kernel=kernel)
+    offset, index, counts = _neighbourhoods(mask, cell, kernel=kernel)
     flat = template.flatten(0, 1)
     around, own = flat.index_select(0, index.flatten()).unflatten(0, index.shape), flat.index_select(0, cell)
     return _mean_offset(query, around, counts, offset) - _mean_offset(own, around, counts, offset)
@@ -38,7 +38,7 @@ def _mean_offset(
     return weight @ offset / weight.sum(1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
 
 
-def _neighbours(
+def _neighbourhoods(
     mask: Bool[Tensor, "h w"], cell: Int[Tensor, " m"], *, kernel: int
 ) -> tuple[Float[Tensor, "k 2"], Int[Tensor, "m k"], Bool[Tensor, "m k"]]:
     """Offsets (x, y) in reading order, flat indices of the neighbours (clamped to the map), and which count."""

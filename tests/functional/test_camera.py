@@ -76,7 +76,7 @@ def test_local_zoom_is_what_a_small_square_grows_by():
 
 
 def test_a_box_around_a_right_angle_is_refused():
-    with pytest.raises(ValueError, match="right angle away from its centre"):
+    with pytest.raises(ValueError, match="90 degrees or more from its centre"):
         virtual_crop((5e5, 5e5, 9e6, 9e6), K, size=64, padding_ratio=1.2)
 
 

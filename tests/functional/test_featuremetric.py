@@ -21,11 +21,11 @@ def smooth_map(seed: int) -> np.ndarray:
     return np.stack(waves, axis=-1).astype(np.float32) + 0.5
 
 
-def scene(*, directions: bool) -> tuple[Surface, FeatureField]:
+def scene(*, normalize: bool) -> tuple[Surface, FeatureField]:
     rng = np.random.default_rng(0)
     points, d = rng.uniform(-40, 40, (60, 3)), rng.normal(size=(60, C)).astype(np.float32)
-    d = featuremetric.l2_normalize(d) if directions else d
-    field = FeatureField.from_map(smooth_map(1), np.ones((H, W), bool), directions=directions)
+    d = featuremetric.l2_normalize(d) if normalize else d
+    field = FeatureField.from_map(smooth_map(1), np.ones((H, W), bool), normalize=normalize)
     return Surface(points, d, np.full(60, 2.0)), field
 
 
@@ -45,9 +45,9 @@ def test_derivatives_of_a_projection_by_a_homography_are_those_of_finite_differe
 
 
 @LOSSES
-@pytest.mark.parametrize("directions", [False, True])
-def test_gradient_of_the_cost_is_that_of_finite_differences(alpha, directions):
-    surface, field = scene(directions=directions)
+@pytest.mark.parametrize("normalize", [False, True])
+def test_gradient_of_the_cost_is_that_of_finite_differences(alpha, normalize):
+    surface, field = scene(normalize=normalize)
     robust = RobustLoss(alpha, 0.7)
     _, _, gradient, centre = featuremetric.normal_equations(surface, field, K_CELL, T, robust)
     for k in range(6):
@@ -71,8 +71,8 @@ def test_a_map_that_is_linear_in_place_is_read_exactly():
     found = featuremetric.residuals_at(field, xy, asked)
     J = np.array([[1.0, 0.0], [0.0, 2.0], [1.0, -1.0]])
     np.testing.assert_allclose(found.squared, np.square(true - asked).sum(1), rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(found.pull, (true - asked) @ J, rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(found.curve, np.broadcast_to(J.T @ J, (50, 2, 2)), rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(found.half_gradient, (true - asked) @ J, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(found.half_hessian, np.broadcast_to(J.T @ J, (50, 2, 2)), rtol=1e-4, atol=1e-3)
 
 
 @LOSSES
@@ -84,13 +84,13 @@ def test_weight_is_twice_the_derivative_of_the_loss(alpha):
 
 
 def test_points_out_of_view_cost_what_an_unseen_point_costs_and_nothing_is_won_by_it():
-    surface, field = scene(directions=True)
+    surface, field = scene(normalize=True)
     away = T.copy()
     for shift in ([900.0, 0, 0], [0, 0, -3000.0]):  # beside the map, behind the camera
         away[:3, 3] = T[:3, 3] + shift
         squared, seen = featuremetric.squared_residuals(surface, field, K_CELL, away)
         assert not seen.any()
-        assert (squared == surface.unseen).all()
+        assert (squared == surface.unobserved).all()
         cost, H_, g, _ = featuremetric.normal_equations(surface, field, K_CELL, away, RobustLoss(-2.0, 0.5))
         assert cost == pytest.approx(RobustLoss(-2.0, 0.5).cost(np.array([2.0]))[0])
         assert not H_.any()
@@ -101,7 +101,7 @@ def test_points_out_of_view_cost_what_an_unseen_point_costs_and_nothing_is_won_b
 
 @LOSSES
 def test_no_step_raises_the_cost(alpha):
-    surface, field = scene(directions=True)
+    surface, field = scene(normalize=True)
     robust, costs, pose = RobustLoss(alpha, 0.5), [], T
     for _ in range(8):
         costs.append(featuremetric.normal_equations(surface, field, K_CELL, pose, robust)[0])

@@ -79,7 +79,7 @@ class Featuremetric(Spec):
                 cell,
                 points,
                 sigma_cells=sigma,
-                directions=self.normalise,
+                normalize=self.normalise,
             )
             robust = RobustLoss(ALPHA[self.loss], self.scale * robust_scale(surface, field, K_cell, T))
             T = descend(surface, field, K_cell, T, robust, iterations=self.iterations)
