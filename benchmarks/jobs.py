@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from benchmarks.measure import Figure, interleaved, peak_bytes
-from pipeline.__main__ import CONF, options_of, stages_of, variant
+from pipeline.configuration import CONF, build_options, build_stages, build_variant
 from pipeline.run import run
 from pipeline.store import Store
 
@@ -35,11 +35,11 @@ def job(folder: Path, *overrides: str) -> None:
     assert isinstance(values, dict)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         run(
-            stages=stages_of(values),  # type: ignore[arg-type]
-            dataset=variant(values["dataset"], "dataset"),
-            store=Store(variant(values["store"], "store")),
-            runtime=variant(values["runtime"], "runtime"),
-            options=options_of(values),  # type: ignore[arg-type]
+            stages=build_stages(values),  # type: ignore[arg-type]
+            dataset=build_variant(values["dataset"], "dataset"),
+            store=Store(build_variant(values["store"], "store")),
+            runtime=build_variant(values["runtime"], "runtime"),
+            options=build_options(values),  # type: ignore[arg-type]
         )
 
 

@@ -384,3 +384,9 @@ def test_cache_commands_list_measure_verify_and_clean(dzop):
     assert dzop("cache", "gc", "--older-than", "0", "--dry-run").out.count("would remove") > 5
     key = dzop("cache", "ls").out.split("/")[-1].strip()
     assert '"recipe"' in dzop("cache", "path", key[:12]).out
+
+
+def test_help_names_the_commands_the_variants_and_the_fields(capsys, monkeypatch):
+    shown = run_dzop(capsys, monkeypatch, "--help").out
+    for line in ("dzop cache --help", "match: cosine, masked_cosine, oracle, words", "gallery: 12"):
+        assert line in shown

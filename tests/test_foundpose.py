@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 from test_sweep_files import CONF
 from tiny_bop import edit_json, write_tiny_bop
 
-from pipeline.__main__ import stages_of
 from pipeline.bop.dataset import open_dataset
+from pipeline.configuration import build_stages
 from pipeline.fits import chain
 from pipeline.functional.viewpoints import viewpoint_rotations
 from pipeline.graph import Context, Graph
@@ -28,7 +28,7 @@ SMALL = ("render=raycast", "render.count=9", "render.inplane=2", "render.size=96
 def stages(*overrides: str):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=["dataset=lmo", *WITH_HOG, *overrides])
-    return stages_of(OmegaConf.to_container(config, resolve=True))
+    return build_stages(OmegaConf.to_container(config, resolve=True))
 
 
 @pytest.fixture

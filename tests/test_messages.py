@@ -13,7 +13,7 @@ from command import Ran, heeds_ctrl_c, run_dzop
 from make_vit import write_vit
 from PIL import Image
 
-from pipeline.__main__ import _closing
+from pipeline.cli.sweep import failures_text
 from pipeline.report.run_records import read_run_records, unresolved_failures
 from pipeline.synthetic.scenes import write_dataset
 
@@ -75,14 +75,14 @@ def test_a_failure_is_forgotten_once_its_job_has_ended_well_with_other_weights(d
     assert [row.config["cluster"]["count"] for row in unresolved_failures(rows)] == [3]
 
 
-def test_a_sweep_ends_with_a_line_that_can_be_read(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["dzop", "-m", "dataset=lmo", "a=1,2,3,4,5"])
+def test_a_sweep_ends_with_a_line_that_can_be_read():
+    command = ["dzop", "-m", "dataset=lmo", "a=1,2,3,4,5"]
     failed = [(["dataset=lmo", f"a={n}"], "weights: found nothing") for n in range(5)]
-    assert _closing(failed[:2]) == "a=0, a=1 (weights: found nothing)"
-    assert _closing(failed) == "a=0, a=1, a=2, and 2 more, told above (weights: found nothing)"
-    others = _closing([(["dataset=lmo", f"a={n}"], f"{n}: " + "word " * 500) for n in range(9)])
+    assert failures_text(failed[:2], command) == "a=0, a=1 (weights: found nothing)"
+    assert failures_text(failed, command) == "a=0, a=1, a=2, and 2 more, see above (weights: found nothing)"
+    others = failures_text([(["dataset=lmo", f"a={n}"], f"{n}: " + "word " * 500) for n in range(9)], command)
     assert len(others) < 1000
-    assert others.endswith("; and 6 more, told above")
+    assert others.endswith("; and 6 more, see above")
 
 
 def inside(row: int, column: int, h: int, w: int) -> np.ndarray:
@@ -146,7 +146,7 @@ def test_an_odd_box_or_camera_is_told(photo, given, told):
         ("dataset.msk=a", "error: Could not override 'dataset.msk': found no such field, needs one that the yamls"),
         (
             "dataset.mask=my(mask.png",
-            """'my(mask.png': a value with such signs needs both quotes, as 'dataset.image=""",
+            """'my(mask.png': a value with special characters needs both kinds of quotes, as 'dataset.image=""",
         ),
     ],
 )
@@ -175,7 +175,7 @@ command.main()
 
 def test_ctrl_c_leaves_one_line():
     ran = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=120, check=False)
-    assert ran.stderr == "interrupted: what was complete is kept, and the next run goes on from there\n"
+    assert ran.stderr == "interrupted. Completed entries are cached; rerun to resume.\n"
 
 
 def test_ctrl_c_while_packages_load_ends_quietly(tmp_path):

@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from pipeline.__main__ import stages_of
+from pipeline.configuration import build_stages
 from pipeline.report.names import AXIS_TITLES
 from pipeline.report.published import ABLATIONS
 
@@ -33,7 +33,7 @@ def test_a_sweep_names_itself_and_every_job_of_it_composes(name):
         for value in override.sweep_string_iterator():
             config = composed(f"sweep={name}", f"{override.key_or_group}={value}")
             assert (config["overlays"], config["gallery"], config["sweep"]) == (False, 0, name)
-            stages_of(config)
+            build_stages(config)
 
 
 @pytest.mark.parametrize("axis", ABLATIONS)

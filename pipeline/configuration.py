@@ -1,0 +1,108 @@
+"""Resolved configuration -> the specs of a run. Values are plain dicts; of Hydra only class lookup is used here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import get_class
+from pydantic.dataclasses import is_pydantic_dataclass
+
+from pipeline.errors import BadInput
+from pipeline.io.checkpoints import NotDownloaded
+from pipeline.options import Evaluate, Options, Select
+from pipeline.route import SecondLook, Stages
+from pipeline.spec import build
+
+PACKAGE = Path(__file__).resolve().parent
+CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
+STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
+OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method")
+REQUIRED = (*STAGES, *OPTIONS, "second_look", "fallback", "dataset", "store", "runtime", "select", "evaluate")
+"""Fields of config.yaml that a run needs and that ``~field`` on the command line can remove."""
+
+
+def check_fields(values: Mapping[str, Any]) -> None:
+    """Raise BadInput for a required field that was removed."""
+    for name in REQUIRED:
+        if name not in values:
+            raise BadInput(name, found="nothing", needed=f"a value: leave ~{name} out")
+
+
+def build_stages(values: Mapping[str, Any]) -> Stages:
+    """The variant of every stage."""
+    stages = {name: build_variant(values[name], name) for name in STAGES}
+    if hasattr(stages["fuse"], "resolve_for"):
+        stages["fuse"] = stages["fuse"].resolve_for(_model_name(stages["extract"]))
+    if not isinstance(values["fallback"], bool):
+        raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
+    second_look: SecondLook = build_variant(values["second_look"], "second_look")
+    return Stages(**stages, fallback=values["fallback"], second_look=second_look.hypotheses)
+
+
+def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options:
+    """What to run and where to write."""
+    given = {name: values[name] for name in OPTIONS}
+    built = {
+        "sweep": values.get("sweep"),
+        "select": build(Select, values["select"], where="select"),
+        "evaluate": build(Evaluate, values["evaluate"], where="evaluate"),
+        "label": {stage: values[stage]["_target_"].rsplit(".", 2)[-2] for stage in STAGES},
+        "config": values,
+        "resume": resume,
+    }
+    return build(Options, given | built, where="config")
+
+
+def build_variant(values: Mapping[str, Any], where: str) -> Any:
+    """The spec whose class ``_target_`` names, with checked fields; ``auto`` variants return the one they select.
+
+    Fields that have a ``_target_`` of their own are built first, to any depth. Raises BadInput.
+    """
+    fields = {name: _build_field(value, f"{where}.{name}") for name, value in values.items()}
+    cls = _find_class(fields.pop("_target_", None), f"{where}._target_")
+    variant: Any = build(cls, fields, where=where)
+    return variant.resolve() if hasattr(variant, "resolve") else variant
+
+
+def _build_field(value: Any, where: str) -> Any:
+    return build_variant(value, where) if isinstance(value, Mapping) and "_target_" in value else value
+
+
+def _find_class(target: object, where: str) -> type:
+    """Import a spec class by its path. Raises BadInput."""
+    if not isinstance(target, str):
+        raise BadInput(where, found=repr(target), needed="the import path of a class")
+    if target.split(".")[0] != "pipeline" and not _may_import_others():
+        needed = "a class of pipeline; others are named in a yaml below the folder of --config-dir"
+        raise BadInput(where, found=repr(target), needed=needed)
+    try:
+        cls = get_class(target)
+    except (ImportError, ValueError, AttributeError) as error:
+        raise BadInput(where, found=f"{target!r} ({error})", needed="the import path of a class") from None
+    if not is_pydantic_dataclass(cls):
+        raise BadInput(where, found=repr(target), needed="a class made with @spec")
+    return cls
+
+
+def _may_import_others() -> bool:
+    """Whether classes outside the package may be imported.
+
+    Importing runs code, so it takes a folder of the user's own yamls (--config-dir) and no ``_target_`` among the
+    overrides.
+    """
+    if not HydraConfig.initialized():
+        return False
+    hydra = HydraConfig.get()
+    has_config_dir = any(source.provider == "command-line" for source in hydra.runtime.config_sources)
+    return has_config_dir and not any("_target_" in override for override in hydra.overrides.task)
+
+
+def _model_name(extract: Any) -> str:
+    """Name of the extractor's model, by which fuse=auto looks for a head that was trained on its features."""
+    try:
+        return str(extract.model)
+    except NotDownloaded:
+        return str(extract.kind)  # no head ships for weights that have to be downloaded
