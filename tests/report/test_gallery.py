@@ -5,20 +5,10 @@ import torch
 from pipeline.items.features import Clusters
 from pipeline.items.matches import Correspondences
 from pipeline.items.views import Image
-from pipeline.report.gallery import (
-    GAP_PX,
-    INLIER,
-    LINES_SHOWN,
-    OUTLIER,
-    PANEL_PX,
-    TITLE_PX,
-    Card,
-    draw_card,
-    evenly,
-    paint_clusters,
-    pick_cases,
-)
+from pipeline.report.cluster_colours import paint_clusters
+from pipeline.report.gallery import INLIER, MAX_LINES, OUTLIER, Card, draw_card, pick_cases, pick_evenly
 from pipeline.report.overlay import DrawnPose
+from pipeline.report.panels import GAP_PX, PANEL_PX, TITLE_PX
 from pipeline.synthetic.objects import make_object
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
@@ -82,9 +72,9 @@ def test_the_same_case_gives_the_same_card():
 
 
 def test_not_more_lines_are_drawn_than_an_eye_can_follow():
-    assert len(evenly(5000, LINES_SHOWN)) == LINES_SHOWN
-    assert evenly(3, LINES_SHOWN) == [0, 1, 2]
-    assert evenly(0, LINES_SHOWN) == []
+    assert len(pick_evenly(5000, MAX_LINES)) == MAX_LINES
+    assert pick_evenly(3, MAX_LINES) == [0, 1, 2]
+    assert pick_evenly(0, MAX_LINES) == []
 
 
 def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
