@@ -106,10 +106,7 @@ def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, 
     """Closed outlines (and holes) of the silhouette, pixels, smoothed over five contour points."""
     if transform(item.T_cam_obj, _corners(item.mesh))[:, 2].max() < _NEAR_MM:
         return []
-    (h, w), margin = (
-        size_hw,
-        8,
-    )  # rendered beyond the image, so that outlines of objects at its border continue to the edge
+    (h, w), margin = size_hw, 8  # rendered beyond the image, so that outlines of cut objects leave the image
     shifted = np.array([[1.0, 0, margin], [0, 1, margin], [0, 0, 1]]) @ K
     depth = render_depth(item.mesh, shifted, item.T_cam_obj[None], (h + 2 * margin, w + 2 * margin))[0]
     return [_smooth(contour) - margin for contour in _contours(depth > 0)]
