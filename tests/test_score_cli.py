@@ -32,7 +32,7 @@ def true_rows(root: Path, name: str = "tiny", models: str = "models") -> list[Re
     return [
         ResultRow(t.scene_id, t.im_id, t.obj_id, 1.0, gt.T_cam_obj, 0.5)
         for t in data.targets
-        for gt in scorer.counted(t)
+        for gt in scorer.scored_instances(t)
     ]
 
 

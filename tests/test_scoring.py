@@ -21,8 +21,8 @@ def true_rows(scorer: Scorer, *, symmetry: int | None = None) -> list[ResultRow]
     """Ground truth as results; ``symmetry``: turned by that symmetry of each object."""
     rows = []
     for target in scorer.targets:
-        for gt in scorer.counted(target):
-            symmetries = scorer.shape(target.obj_id).model.symmetries
+        for gt in scorer.scored_instances(target):
+            symmetries = scorer.mesh(target.obj_id).model.symmetries
             turn = np.eye(4) if symmetry is None else symmetries[symmetry % len(symmetries)]
             rows.append(ResultRow(target.scene_id, target.im_id, target.obj_id, 1.0, gt.T_cam_obj @ turn, -1.0))
     return rows
@@ -115,7 +115,7 @@ def test_turning_and_moving_the_camera_changes_no_distance(tiny):
     off = rigid(Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([3.0, -2.0, 5.0]))
     est = row.T_cam_obj @ off
     (errors,) = tiny.score([ResultRow(row.scene_id, row.im_id, row.obj_id, 1.0, est, -1.0)]).errors
-    vertices = tiny.shape(row.obj_id).vertices
+    vertices = tiny.mesh(row.obj_id).vertices
     moved = np.linalg.norm(vertices @ off[:3, :3].T + off[:3, 3] - vertices, axis=1)
     assert errors.mssd_mm == pytest.approx(moved.max())
     assert errors.add_mm == pytest.approx(moved.mean())

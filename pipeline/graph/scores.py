@@ -145,7 +145,7 @@ class ScoreNodes:
                     continue
                 scene_id, im_id, obj_id, gt_id = instance
                 T_gt = self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
-                model, K = self.scorer.shape(obj_id).model, self.context.K((scene_id, im_id))
+                model, K = self.scorer.mesh(obj_id).model, self.context.K((scene_id, im_id))
                 off = correspondence_errors_mm(best.points_obj, best.query_px_img, K, T_gt, model.symmetries)
                 if len(off):
                     found.append([*instance, float(np.median(off)) / model.diameter_mm])
@@ -158,7 +158,7 @@ class ScoreNodes:
         scene_id, im_id, obj_id, gt_id = instance
         T_template = self.templates.read_views(obj_id, [answer.template_id]).T_cam_obj[0]
         T_gt = self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
-        return template_error(T_template, T_gt, self.scorer.shape(obj_id).model.symmetries)
+        return template_error(T_template, T_gt, self.scorer.mesh(obj_id).model.symmetries)
 
 
 def _rows(answers: Sequence[Answer]) -> list[tuple[int, ResultRow]]:

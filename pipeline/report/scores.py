@@ -1,4 +1,4 @@
-"""scores -> the table a terminal shows, and the figures as numbers."""
+"""Scores of a run -> a table for the terminal, and a summary as JSON."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from pipeline.metrics.recall import (
 from pipeline.scoring import ScoringResult
 
 ADD_LIMIT = 0.1
-"""ADD and ADI count as right below this part of the diameter (Hinterstoisser et al., ACCV 2012)."""
+"""An estimate is correct if its ADD or ADI is below this share of the diameter (Hinterstoisser et al., ACCV 2012)."""
 
 
 def scores_table(scored: ScoringResult, *, theta_max: float = 0.5) -> str:
-    """Average recalls with their intervals, by object and by visible fraction; and why VSD is not there, if so."""
+    """Average recalls with intervals, by object and by visible fraction; says why VSD is missing, if it is."""
     scores = scored.scores
     recall = average_recall(scores, theta_max=theta_max)
     spread = intervals(scored, theta_max=theta_max)
@@ -45,7 +45,7 @@ def scores_table(scored: ScoringResult, *, theta_max: float = 0.5) -> str:
 
 
 def intervals(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, Interval]:
-    """Bootstrap intervals over images, by metric; those that are not available are left out."""
+    """95 % bootstrap intervals over images, by metric; metrics that are not available are left out."""
     scores = scored.scores
     values, image = instance_recalls(scores, theta_max=theta_max), image_index(scores.scene_id, scores.im_id)
     columns = {"AR_VSD": values[:, 0], "AR_MSSD": values[:, 1], "AR_MSPD": values[:, 2]}
@@ -57,7 +57,7 @@ def intervals(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, Int
 
 
 def summary_of(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, Any]:
-    """Every figure, JSON-able; None for what is not available."""
+    """All summary figures as JSON values; None for those that are not available."""
     scores, recall = scored.scores, average_recall(scored.scores, theta_max=theta_max)
     return {
         "metrics": metrics_of(recall) | error_recalls(scored),
@@ -76,12 +76,12 @@ def summary_of(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, An
 
 
 def metrics_of(recall: AverageRecall) -> dict[str, float | None]:
-    """Average recalls under their names in BOP."""
+    """Average recalls by their BOP names."""
     return {"AR": recall.ar, "AR_VSD": recall.vsd, "AR_MSSD": recall.mssd, "AR_MSPD": recall.mspd}
 
 
 def error_recalls(scored: ScoringResult) -> dict[str, float | None]:
-    """Shares of the instances that an estimate hits within 0.1 diameters by ADD and ADI; medians over estimates."""
+    """Share of instances with ADD and ADI below 0.1 diameters; median rotation and translation errors of estimates."""
     nearest = _nearest(scored)
     found = dict.fromkeys(("recall_ADD", "recall_ADI"), 0.0)
     for error in nearest:
@@ -97,7 +97,7 @@ def error_recalls(scored: ScoringResult) -> dict[str, float | None]:
 
 
 def _nearest(scored: ScoringResult) -> list[PoseErrors]:
-    """Each estimate's errors against the instance it is nearest to by MSSD."""
+    """Errors of each estimate against its nearest instance by MSSD."""
     by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
     for error in scored.errors:
         by_row[error.row].append(error)
