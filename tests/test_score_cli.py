@@ -1,4 +1,4 @@
-"""``dzop score`` and ``dzop lint`` as a shell calls them."""
+"""``dzop score`` and ``dzop lint`` from the command line."""
 
 import json
 import time
@@ -36,12 +36,12 @@ def true_rows(root: Path, name: str = "tiny", models: str = "models") -> list[Re
     ]
 
 
-def turned(row: ResultRow, angle_deg: float) -> ResultRow:
+def rotate(row: ResultRow, angle_deg: float) -> ResultRow:
     R = Rotation.from_rotvec([np.deg2rad(angle_deg), 0, 0]).as_matrix() @ row.T_cam_obj[:3, :3]
     return ResultRow(row.scene_id, row.im_id, row.obj_id, row.score, rigid(R, row.T_cam_obj[:3, 3]), row.time_s)
 
 
-def in_metres(row: ResultRow) -> ResultRow:
+def to_metres(row: ResultRow) -> ResultRow:
     T = rigid(row.T_cam_obj[:3, :3], row.T_cam_obj[:3, 3] / 1000)
     return ResultRow(row.scene_id, row.im_id, row.obj_id, row.score, T, -1.0)
 
@@ -52,15 +52,15 @@ def figures(dzop, csv: str, *arguments: str, dataset: str = "tiny") -> dict:
     return json.loads(Path("figures.json").read_text())
 
 
-def test_ground_truth_as_a_csv_scores_one(dzop):
+def test_ground_truth_scores_one(dzop):
     write_results(Path("gt_tiny-test.csv"), true_rows(Path("tiny")))
     ran = dzop("score", "gt_tiny-test.csv", "--dataset", "tiny")
     assert ran.status == 0
     assert "3 targets in 2 images, 3 of them with an estimate" in ran.out
-    told = figures(dzop, "gt_tiny-test.csv")["metrics"]
-    assert (told["AR_MSSD"], told["AR_MSPD"], told["recall_ADD"]) == (1.0, 1.0, 1.0)
-    assert told["AR_VSD"] == 0.75  # a wall hides one of the four boxes
-    assert told["AR"] == pytest.approx((1 + 1 + 0.75) / 3)
+    scores = figures(dzop, "gt_tiny-test.csv")["metrics"]
+    assert (scores["AR_MSSD"], scores["AR_MSPD"], scores["recall_ADD"]) == (1.0, 1.0, 1.0)
+    assert scores["AR_VSD"] == 0.75  # a wall hides one of the four boxes
+    assert scores["AR"] == pytest.approx((1 + 1 + 0.75) / 3)
 
 
 def test_vsd_is_not_available_rather_than_zero_where_depth_is_missing(dzop):
@@ -68,14 +68,14 @@ def test_vsd_is_not_available_rather_than_zero_where_depth_is_missing(dzop):
     Path("tiny/test/000007/depth/000003.png").unlink()
     ran = dzop("score", "gt_tiny-test.csv", "--dataset", "tiny")
     assert "1 of 2 images have no depth image (the first is scene 7, image 3)" in ran.out
-    told = figures(dzop, "gt_tiny-test.csv")
-    assert told["metrics"]["AR"] is told["metrics"]["AR_VSD"] is None
-    assert told["metrics"]["AR_MSSD"] == 1.0
+    scores = figures(dzop, "gt_tiny-test.csv")
+    assert scores["metrics"]["AR"] is scores["metrics"]["AR_VSD"] is None
+    assert scores["metrics"]["AR_MSSD"] == 1.0
     assert figures(dzop, "gt_tiny-test.csv", "--no-vsd")["no_vsd"] == "not asked for"
 
 
-def test_annotations_and_models_are_enough(dzop):
-    """Scores need no photograph and no mask; BOP's own width stands in for that of the images."""
+def test_scoring_needs_annotations_and_models_only(dzop):
+    """Without photographs and masks, BOP's image width of the dataset is used."""
     write_results(Path("gt_lmo-test.csv"), true_rows(Path("tiny")))
     for folder in ("rgb", "depth", "mask", "mask_visib"):
         for path in Path("tiny/test/000007", folder).iterdir():
@@ -87,26 +87,26 @@ def test_annotations_and_models_are_enough(dzop):
     assert "needs one of them, for its width" in ran.err
 
 
-def test_a_difference_to_another_csv_is_paired(dzop):
+def test_the_difference_to_another_csv_is_paired(dzop):
     rows = true_rows(Path("tiny"))
     write_results(Path("gt_tiny-test.csv"), rows)
-    write_results(Path("off_tiny-test.csv"), [turned(row, 20) for row in rows])
+    write_results(Path("off_tiny-test.csv"), [rotate(row, 20) for row in rows])
     against = figures(dzop, "off_tiny-test.csv", "--no-vsd", "--against", "gt_tiny-test.csv")["against"]
     assert against["csv"] == "gt_tiny-test.csv"
     assert -1 < against["low"] <= against["mean"] <= against["high"] < 0
 
 
 @pytest.mark.parametrize("t", [(1e300, 0, 1e300), (0, 0, 0), (0, 0, -500), (1e9, 0, 1e-9)])
-def test_a_pose_anywhere_is_a_miss_and_no_warning(dzop, t, recwarn):
+def test_a_pose_far_off_is_a_miss_without_a_warning(dzop, t, recwarn):
     rows = true_rows(Path("tiny"))
-    odd = [ResultRow(r.scene_id, r.im_id, r.obj_id, 1.0, rigid(np.eye(3), np.array(t, float)), 0.5) for r in rows]
-    write_results(Path("odd_tiny-test.csv"), odd)
-    told = figures(dzop, "odd_tiny-test.csv")["metrics"]
-    assert (told["AR_MSSD"], told["AR_MSPD"], told["recall_ADI"]) == (0.0, 0.0, 0.0)
+    far = [ResultRow(r.scene_id, r.im_id, r.obj_id, 1.0, rigid(np.eye(3), np.array(t, float)), 0.5) for r in rows]
+    write_results(Path("far_tiny-test.csv"), far)
+    scores = figures(dzop, "far_tiny-test.csv")["metrics"]
+    assert (scores["AR_MSSD"], scores["AR_MSPD"], scores["recall_ADI"]) == (0.0, 0.0, 0.0)
     assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
 
 
-def test_a_row_for_the_report_keeps_the_scores(dzop):
+def test_the_record_for_the_report_has_the_scores(dzop):
     write_results(Path("other_tiny-test.csv"), true_rows(Path("tiny")))
     assert dzop("score", "other_tiny-test.csv", "--dataset", "tiny", "--out", "results").status == 0
     (row,) = read_run_records(Path("results"))
@@ -114,18 +114,18 @@ def test_a_row_for_the_report_keeps_the_scores(dzop):
     assert row.scores.mssd.all()
 
 
-def test_rows_of_another_dataset_are_refused_and_a_subset_must_be_asked_for(dzop):
+def test_rows_of_another_dataset_are_refused_unless_subset_is_given(dzop):
     rows = true_rows(Path("tiny"))
-    stranger = ResultRow(7, 99, 1, 1.0, rows[0].T_cam_obj, 0.5)
-    write_results(Path("m_tiny-test.csv"), [*rows, stranger])
+    unknown = ResultRow(7, 99, 1, 1.0, rows[0].T_cam_obj, 0.5)
+    write_results(Path("m_tiny-test.csv"), [*rows, unknown])
     ran = dzop("score", "m_tiny-test.csv", "--dataset", "tiny")
     assert ran.status == 1
-    assert "found 1 of 5 rows of what tiny does not have, the first: scene 7, image 99, object 1" in ran.err
+    assert "found 1 of 5 rows with ids that tiny does not have, the first: scene 7, image 99, object 1" in ran.err
     assert figures(dzop, "m_tiny-test.csv", "--subset")["metrics"]["AR_MSSD"] == 1.0
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("score", "absent.csv", "--dataset", "tiny"), "absent.csv: found no such file"),
         (("score", "gt_tiny-test.csv", "--dataset", "nowhere"), "nowhere: found no such folder"),
@@ -137,18 +137,18 @@ def test_rows_of_another_dataset_are_refused_and_a_subset_must_be_asked_for(dzop
         (("lint", "absent.csv"), "absent.csv: found no such file"),
     ],
 )  # fmt: skip
-def test_bad_input_is_one_line(dzop, arguments, told):
+def test_bad_input_is_one_line(dzop, arguments, message):
     write_results(Path("gt_tiny-test.csv"), true_rows(Path("tiny")))
     text = Path("gt_tiny-test.csv").read_text()
     Path("nan_tiny-test.csv").write_text(text.replace("1.0 0.0 0.0 0.0", "nan 0.0 0.0 0.0", 1))
     Path("header_tiny-test.csv").write_text(text.splitlines()[0])
     ran = dzop(*arguments)
     assert ran.status == 1
-    assert told in ran.err
+    assert message in ran.err
     assert "Traceback" not in ran.err
 
 
-def test_lint_passes_a_good_csv(dzop):
+def test_lint_accepts_a_valid_csv(dzop):
     write_results(Path("gt_tiny-test.csv"), true_rows(Path("tiny")))
     ran = dzop("lint", "gt_tiny-test.csv", "--dataset", "tiny")
     assert ran.status == 0
@@ -178,9 +178,9 @@ def test_lint_lists_every_fault(dzop):
     assert "found 6 faults" in ran.err
 
 
-def test_lint_notes_single_rows_in_metres(dzop):
+def test_lint_notes_single_rows_to_metres(dzop):
     first, *others = true_rows(Path("tiny"))
-    write_results(Path("m_tiny-test.csv"), [replace(in_metres(first), time_s=first.time_s), *others])
+    write_results(Path("m_tiny-test.csv"), [replace(to_metres(first), time_s=first.time_s), *others])
     ran = dzop("lint", "m_tiny-test.csv", "--dataset", "tiny")
     assert ran.status == 0
     assert "note:  t of 1 rows is shorter than 20 mm (in metres?)" in ran.out
@@ -188,8 +188,8 @@ def test_lint_notes_single_rows_in_metres(dzop):
 
 
 def test_lint_notices_metres_and_rounded_rotations(dzop):
-    rows = [turned(row, 10) for row in true_rows(Path("tiny"))]
-    small = [in_metres(row) for row in rows]
+    rows = [rotate(row, 10) for row in true_rows(Path("tiny"))]
+    small = [to_metres(row) for row in rows]
     write_results(Path("m_tiny-test.csv"), small)
     ran = dzop("lint", "m_tiny-test.csv")
     assert ran.status == 1
@@ -203,14 +203,14 @@ def test_lint_notices_metres_and_rounded_rotations(dzop):
 
 
 @pytest.mark.slow
-def test_lmos_photographs_are_scored_at_a_hundred_targets_a_minute_and_more(bop_mini):
-    """1,425 estimates, as many as LM-O's test set has: the 285 targets of its fifth part, turned by five angles."""
+def test_lmo_is_scored_at_a_hundred_targets_a_minute_or_more(bop_mini):
+    """1,425 estimates, as many as LM-O's test set has: 285 targets, a fifth of it, each rotated by five angles."""
     root = bop_mini / "lmo"
     data = open_dataset(root, name="lmo", models="models_eval", photographs=False)
     scorer, rows = Scorer(data, data.targets, "models_eval"), true_rows(root, "lmo", "models_eval")
     start = time.perf_counter()
     recalls = [
-        average_recall(scorer.score([turned(row, angle) for row in rows]).scores) for angle in (5, 10, 20, 40, 90)
+        average_recall(scorer.score([rotate(row, angle) for row in rows]).scores) for angle in (5, 10, 20, 40, 90)
     ]
     assert time.perf_counter() - start < 5 * 285 / 100 * 60
     assert [r.mspd for r in recalls] == sorted((r.mspd for r in recalls), reverse=True)
