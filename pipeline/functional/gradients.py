@@ -1,4 +1,4 @@
-"""images -> histograms of oriented gradients by cell (Dalal and Triggs, CVPR 2005), with those of the cells around."""
+"""images -> histograms of oriented gradients per cell (Dalal and Triggs, CVPR 2005), with neighbouring cells."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 ORIENTATIONS, CONTRAST = 8, 0.02
-EDGES = 12  # the layer of edge histograms: past the decoder's 0 to 11
+EDGES = 12  # layer number of the edge histograms, after the decoder's 0 to 11
 
 
 def edge_histograms(
     rgb: UInt8[Tensor, "n S S 3"], mask: Bool[Tensor, "n S S"], *, cells: int
 ) -> Float[Tensor, "n 8 h w"]:
-    """Histograms of signed gradients, the mask's border among them, in overlapping windows of two cells a side."""
+    """Histograms of signed gradients, silhouette included, over overlapping windows of 2 x 2 cells."""
     energy = oriented_energy(rgb, mask, orientations=ORIENTATIONS, signed=True, silhouette=1.0)
     return smooth_histograms(cell_means(energy, cells=cells))
 
@@ -24,9 +24,10 @@ def edge_histograms(
 def append_edges(
     descriptors: Float[Tensor, "n d h w"], histograms: Float[Tensor, "n 8 h w"], *, weight: float
 ) -> Float[Tensor, "n d+72 h w"]:
-    """Descriptors at length 1, beside the histograms of each cell and its neighbours at length ``weight`` or less.
+    """Descriptors of length 1, concatenated with edge histograms of each cell's 3 x 3 neighbourhood.
 
-    Cosines of the whole are means of both cosines, weighted by 1 and ``weight`` squared.
+    The histograms have length at most ``weight``, so the cosine of the result weights the descriptors' cosine by 1 and
+    the histograms' by up to ``weight`` squared.
     """
     edges = append_neighbours(histograms, distance=1, contrast=CONTRAST)
     return torch.cat([normalize(descriptors.float(), dim=1), weight * edges], dim=1)
@@ -40,27 +41,29 @@ def oriented_energy(
     signed: bool,
     silhouette: float,
 ) -> Float[Tensor, "n o S S"]:
-    """Gradient magnitude (grey levels 0..1 per pixel) of every pixel, shared linearly by the two nearest orientations.
+    """Gradient magnitude per pixel (grey levels 0..1 per px), split linearly between the two nearest orientations.
 
-    Central differences, no smoothing, of the colour channel with the strongest gradient (Dalal and Triggs, Sec. 6.2).
+    Central differences without smoothing, of the colour channel with the strongest gradient (Dalal and Triggs, Sec.
+    6.2). ``signed``: orientations cover 360 instead of 180 degrees. ``silhouette``: factor for gradients that cross the
+    mask's border.
     """
-    image = rgb.permute(0, 3, 1, 2).float()  # whole numbers: two channels that tie do so exactly
+    image = rgb.permute(0, 3, 1, 2).float()  # integer values, so that ties between channels are exact
     dx, dy = (_central_difference(image, axis=axis) for axis in (3, 2))
     length = torch.hypot(dx, dy)
     magnitude, strongest = length.max(dim=1, keepdim=True)
     dx, dy, magnitude = dx.gather(1, strongest)[:, 0], dy.gather(1, strongest)[:, 0], magnitude[:, 0]
     magnitude = magnitude / 255 * torch.where(_crosses_border(mask), silhouette, 1.0)
-    turn = 2 * math.pi if signed else math.pi
-    place = torch.atan2(dy, dx).remainder(turn) * (orientations / turn)
-    share = place.frac() * magnitude
-    lower = place.long() % orientations
+    period = 2 * math.pi if signed else math.pi
+    bin_position = torch.atan2(dy, dx).remainder(period) * (orientations / period)
+    share = bin_position.frac() * magnitude
+    lower = bin_position.long() % orientations
     energy = torch.zeros(len(rgb), orientations, *mask.shape[1:], device=rgb.device)
     energy.scatter_(1, lower[:, None], (magnitude - share)[:, None])
     return energy.scatter_(1, ((lower + 1) % orientations)[:, None], share[:, None])
 
 
 def cell_means(energy: Float[Tensor, "n o S S"], *, cells: int) -> Float[Tensor, "n o h w"]:
-    """Mean energy per cell; a crop whose side is no multiple of the cells is enlarged to one first."""
+    """Mean energy per cell. A crop whose size is not a multiple of ``cells`` is first enlarged to the next multiple."""
     size = energy.shape[-1]
     if size % cells:
         size = cells * math.ceil(size / cells)
@@ -69,7 +72,7 @@ def cell_means(energy: Float[Tensor, "n o S S"], *, cells: int) -> Float[Tensor,
 
 
 def smooth_histograms(histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n o h w"]:
-    """Weighted (1 2 1) / 4 with the neighbours along both axes: windows twice a cell wide that overlap by half."""
+    """Histograms smoothed with (1 2 1) / 4 along both axes: windows two cells wide that overlap by half."""
     h, w = histograms.shape[2:]
     x = pad(histograms, (1, 1, 1, 1))
     x = (x.narrow(3, 0, w) + 2 * x.narrow(3, 1, w) + x.narrow(3, 2, w)) / 4
@@ -79,9 +82,10 @@ def smooth_histograms(histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n 
 def append_neighbours(
     histograms: Float[Tensor, "n o h w"], *, distance: int, contrast: float
 ) -> Float[Tensor, "n c h w"]:
-    """Each cell's histogram beside those of 8 neighbours, all scaled by one number to a length of 1 where energy is.
+    """Each cell's histogram concatenated with those of its 8 neighbours, ``distance`` cells away, and normalised.
 
-    The length is sqrt(energy^2 + ``contrast``^2): flat cells stay near zero (L2 norm of Dalal and Triggs, Sec. 6.4).
+    All are divided by sqrt(|v|^2 + ``contrast``^2), v the concatenation, so that cells without contrast stay near zero
+    (L2-norm of Dalal and Triggs, Sec. 6.4). ``distance`` 0: the cell alone, c = o; otherwise c = 9 o.
     """
     h, w = histograms.shape[2:]
     x = pad(histograms, (distance,) * 4)
@@ -94,8 +98,8 @@ def append_neighbours(
 
 
 def _central_difference(image: Float[Tensor, "n 3 S S"], *, axis: int) -> Float[Tensor, "n 3 S S"]:
-    sides = (1, 1, 0, 0) if axis == 3 else (0, 0, 1, 1)
-    padded = pad(image, sides, mode="replicate")
+    padding = (1, 1, 0, 0) if axis == 3 else (0, 0, 1, 1)
+    padded = pad(image, padding, mode="replicate")
     size = image.shape[axis]
     return (padded.narrow(axis, 2, size) - padded.narrow(axis, 0, size)) / 2
 

@@ -1,7 +1,7 @@
-"""k-means that gives the same bytes every time.
+"""Deterministic k-means.
 
-scikit-learn's threads add their partial sums in whatever order they end, and its seeding takes 60 to 150 ms for the
-two maps of a pair; the same seeding and Lloyd's steps below take a quarter of that on two cores.
+scikit-learn's result depends on the order in which its threads finish, and its seeding takes 60 to 150 ms for the two
+maps of a pair; seeding and Lloyd iterations below take a quarter of that on two cores.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import torch
 from jaxtyping import Float32, Int
 from torch import Tensor
 
-_BLOCK = 1 << 14  # points compared with all centres at a time: a whole pair of maps, or a part of an object's templates
+_BLOCK = 1 << 14  # points compared with all centres at a time: both maps of a pair fit in one block
 
 
 def kmeans(
     points: Float32[Tensor, "m c"], *, count: int, seed: int, iterations: int
 ) -> tuple[Int[Tensor, " m"], Float32[Tensor, "k c"]]:
-    """Label of each point and the k <= ``count`` centres; every centre has a point.
+    """Label of each point, and the k <= ``count`` centres; no cluster is empty.
 
-    Lloyd's steps from a seeded k-means++ start (Arthur and Vassilvitskii, SODA 2007), until no label changes or
-    ``iterations`` are done. Runs on the CPU: sums on other devices depend on their order.
+    Lloyd's algorithm from a seeded k-means++ initialisation (Arthur and Vassilvitskii, SODA 2007), until no label
+    changes or after ``iterations``. Runs on the CPU, because sums on GPUs depend on the order of threads.
     """
     x = points.cpu()
     centre = x[torch.from_numpy(kmeans_plus_plus(x.numpy(), count=count, seed=seed))]
@@ -35,9 +35,9 @@ def kmeans(
 
 
 def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: int) -> Int[np.ndarray, " k"]:
-    """Indices of k-means++ seeds: each drawn with probability proportional to its squared distance to those before.
+    """Indices of k-means++ seeds, each drawn with probability proportional to its squared distance to the seeds so far.
 
-    Fewer than ``count`` where there are fewer distinct points.
+    Fewer than ``count`` if there are fewer distinct points.
     """
     draws = np.random.default_rng(seed).random(count)
     squared = np.einsum("mc,mc->m", points, points)
@@ -46,7 +46,7 @@ def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: in
     for draw in draws[1:]:
         i = chosen[-1]
         distance = squared + squared[i] - 2 * (points @ points[i])
-        nearest = np.minimum(nearest, np.where(distance > 1e-6 * squared[i], distance, 0))  # rounding is no distance
+        nearest = np.minimum(nearest, np.where(distance > 1e-6 * squared[i], distance, 0))  # rounding errors become 0
         cumulative = np.cumsum(nearest, dtype=np.float64)
         if cumulative[-1] <= 0:
             break
@@ -58,11 +58,11 @@ def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: in
 def _assign(x: Tensor, centre: Tensor) -> Tensor:
     squared = (centre * centre).sum(1)
     distance = (torch.addmm(squared, rows, centre.T, alpha=-2) for rows in x.split(_BLOCK))
-    return torch.cat([torch.from_numpy(d.numpy().argmin(1)) for d in distance])  # numpy's takes a sixth of torch's time
+    return torch.cat([torch.from_numpy(d.numpy().argmin(1)) for d in distance])  # numpy's argmin is six times as fast
 
 
 def _update_centres(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:
-    """Mean of each cluster's points; a cluster that lost all of them keeps its centre."""
+    """Mean of each cluster's points; an empty cluster keeps its centre."""
     number = torch.bincount(label, minlength=len(centre))[:, None]
     total = torch.zeros_like(centre).index_add_(0, label, x)
     return torch.where(number > 0, total / number.clamp(min=1), centre)

@@ -1,4 +1,4 @@
-"""Feature maps: one resolution for all layers, one scale."""
+"""Feature maps: resampling, scaling and concatenation."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from torch.nn.functional import interpolate, normalize
 
 
 def upsample(features: Float[Tensor, "c h w"], *, cells: int) -> Float[Tensor, "c cells_y cells_x"]:
-    """Bilinear in between cell centres; cell edges stay on cell edges (align_corners=False)."""
+    """Map resampled bilinearly to ``cells`` x ``cells``; the borders coincide (align_corners=False)."""
     if features.shape[-1] == cells:
         return features
     return interpolate(features[None], size=(cells, cells), mode="bilinear", align_corners=False)[0]
 
 
 def root_mean_square_norm(samples: Float[Tensor, "m c"]) -> Float[Tensor, ""]:
-    """Root of the mean squared length of the rows; 1 where that is 0, so that it can divide."""
+    """Root mean square of the rows' lengths; 1 where that is 0, so that it can be divided by."""
     norm = (samples * samples).sum(1).mean().sqrt()
     return torch.where(norm > 0, norm, torch.ones_like(norm))
 
@@ -24,10 +24,10 @@ def root_mean_square_norm(samples: Float[Tensor, "m c"]) -> Float[Tensor, ""]:
 def concatenate_normalized(
     first: Float[Tensor, "n c h w"], second: Float[Tensor, "n d y x"], *, alpha: float
 ) -> Float[Tensor, "n e h w"]:
-    """Both maps on the first's cells, float32: each of length 1 in every cell, times ``alpha`` and 1 - ``alpha``.
+    """Both maps concatenated at the first's resolution, float32: cells normalised, times ``alpha`` and 1 - ``alpha``.
 
-    Zhang et al., NeurIPS 2023 (A Tale of Two Features). The second is resampled before it is scaled: bilinear, cell
-    edges on cell edges, antialiased when it shrinks. A cell that is zero in a map stays zero.
+    The second map is resampled before it is normalised: bilinear, borders coincide, antialiased when it shrinks. A cell
+    of zeros stays zero. Source: Zhang et al., "A Tale of Two Features", NeurIPS 2023.
     """
     size = first.shape[2:]
     if second.shape[2:] != size:

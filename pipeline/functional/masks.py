@@ -1,4 +1,4 @@
-"""Masks of crops at the resolution of feature maps."""
+"""Crop masks at the resolution of feature maps."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-_ROUNDING = 1e-5  # half covered in float32 still counts as half
+_ROUNDING = 1e-5  # a cell covered by exactly half counts as half in float32 too
 
 
 def cell_coverage(mask: Bool[Tensor, "*n S S"], *, cells: int) -> Float[Tensor, "*n cells_y cells_x"]:
-    """Part of each cell's area that the mask covers, 0..1; exact for any ratio of pixels to cells."""
+    """Fraction of each cell's area covered by the mask, 0..1; exact for any ratio of pixels to cells."""
     size = mask.shape[-1]
     stride = size / cells
     pixel = torch.arange(size, dtype=torch.float64)
@@ -21,17 +21,17 @@ def cell_coverage(mask: Bool[Tensor, "*n S S"], *, cells: int) -> Float[Tensor, 
 
 
 def cell_mask(mask: Bool[Tensor, "*n S S"], *, cells: int) -> Bool[Tensor, "*n cells_y cells_x"]:
-    """Foreground cells: those at least half covered.
+    """Foreground cells: those that the mask covers by at least half.
 
-    Where no cell is, the best covered one stands in, so that a mask with a pixel never has no cell.
+    If there are none, the cell covered most, so that a mask with at least one pixel has at least one cell.
     """
-    cover = cell_coverage(mask, cells=cells).flatten(-2)
-    half = cover >= 0.5 - _ROUNDING
-    best, index = cover.max(-1, keepdim=True)
-    stand_in = torch.zeros_like(half).scatter_(-1, index, best > 0)
-    return torch.where(half.any(-1, keepdim=True), half, stand_in).unflatten(-1, (cells, cells))
+    coverage = cell_coverage(mask, cells=cells).flatten(-2)
+    half_covered = coverage >= 0.5 - _ROUNDING
+    most, index = coverage.max(-1, keepdim=True)
+    fallback = torch.zeros_like(half_covered).scatter_(-1, index, most > 0)
+    return torch.where(half_covered.any(-1, keepdim=True), half_covered, fallback).unflatten(-1, (cells, cells))
 
 
 def foreground(mask: Bool[Tensor, "*cells"]) -> Int[Tensor, " m"]:
-    """Flat indices of a cell mask's foreground, in reading order."""
+    """Flat indices of the True cells of a mask, in row-major order."""
     return mask.flatten().nonzero()[:, 0]

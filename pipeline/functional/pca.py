@@ -1,4 +1,4 @@
-"""Principal component analysis by the eigenvectors of the smaller Gram matrix: exact, and the same every time."""
+"""Principal component analysis by eigenvectors of the smaller Gram matrix: exact and deterministic."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_NEGLIGIBLE = 1e-5  # of the largest variance: below it, a float32 Gram matrix of float16 features holds rounding
+_NEGLIGIBLE = 1e-5  # of the largest variance: smaller ones are rounding errors in a float32 Gram matrix
 
 
 def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
-    """Mean, and the k <= ``dim`` orthonormal directions of largest variance, largest first.
+    """Mean, and the k <= ``dim`` orthonormal axes of largest variance, in descending order.
 
-    k is smaller where the samples span fewer dimensions. Of each axis the component of largest magnitude is positive.
-    Only the leading eigenvectors are computed (LAPACK syevr, on the CPU for every device). Raises ValueError for
+    k < ``dim`` if the samples span fewer dimensions. Signs are fixed: the component of largest magnitude of each axis
+    is positive. Only the leading eigenvectors are computed (LAPACK syevr, always on the CPU). Raises ValueError for
     samples that are not finite.
     """
     mean = samples.mean(0)
@@ -31,7 +31,7 @@ def principal_axes(samples: Float[Tensor, "m c"], *, dim: int) -> tuple[Float[Te
 def principal_axes_in_blocks(
     samples: Float[Tensor, "m c"], *, dim: int, block: int = 1 << 13
 ) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
-    """As ``principal_axes``, of more samples than fit in float32: float16 is read block by block, sums are float64.
+    """As ``principal_axes``, for samples too large to copy to float32: blocks are summed in float64.
 
     Results are float32. Raises ValueError for samples that are not finite.
     """
@@ -49,16 +49,16 @@ def principal_axes_in_blocks(
 def project_onto_axes(
     samples: Float[Tensor, "m c"], mean: Float[Tensor, " c"], axes: Float[Tensor, "c k"], *, block: int = 1 << 13
 ) -> Float[Tensor, "m k"]:
-    """Coordinates of samples, less the mean, on the axes, in float32."""
+    """Coordinates of the samples, minus the mean, along the axes; float32."""
     shift = mean @ axes
     return torch.cat([part.float() @ axes - shift for part in samples.split(block)])
 
 
 def _gram_matrix(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
-    """Products of all pairs of rows: numpy knows x x^T for what it is, and computes half of it.
+    """Gram matrix x x^T. On the CPU by numpy, which computes only half of the symmetric product.
 
-    ``exact``, float64: for few samples, whose axes are sums of them over the root of their variance. Otherwise in the
-    samples' own precision, which is as well that of the eigenvectors.
+    ``exact``: in float64, needed when the axes are formed from the samples divided by the root of their variance.
+    Otherwise in the samples' precision.
     """
     if x.device.type != "cpu":
         gram = (x @ x.T).cpu().numpy()
@@ -68,6 +68,7 @@ def _gram_matrix(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:
 
 
 def _leading_eigenvectors(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``dim`` eigenvalues, largest first and without negligible ones, and their eigenvectors as columns."""
     size = len(gram)
     values, vectors = scipy.linalg.eigh(gram, subset_by_index=[max(0, size - dim), size - 1], driver="evr")
     values, vectors = values[::-1].copy(), vectors[:, ::-1].copy()
@@ -76,6 +77,7 @@ def _leading_eigenvectors(gram: np.ndarray, dim: int) -> tuple[np.ndarray, np.nd
 
 
 def _fix_signs(axes: Float[Tensor, "c k"]) -> Float[Tensor, "c k"]:
+    """Axes flipped so that the component of largest magnitude is positive."""
     if axes.shape[1] == 0:
         return axes
     largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))

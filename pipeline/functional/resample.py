@@ -1,6 +1,6 @@
-"""Images under a scale and a translation, or a homography, exact to the sub-pixel.
+"""Antialiased crops of images under scale and translation, or under a homography, with exact sub-pixel positions.
 
-cv2.warpAffine rounds positions to 1/32 pixel and aliases when it shrinks; here each axis has its weights written out.
+cv2.warpAffine rounds positions to 1/32 pixel and aliases when it shrinks.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from jaxtyping import Float, Shaped
 
 from pipeline.functional.camera import apply_homography, local_zoom
 
-_FINEST = 16  # samples a side of a crop pixel at most: a crop that shrinks by more shows nothing anyway
+_MAX_SAMPLES = 16  # samples per axis and crop pixel; an object shrunk by more is not recognisable
 
 
 def resample(
     image: Shaped[np.ndarray, "H W *c"], A_crop_img: Float[np.ndarray, "3 3"], *, size: int
 ) -> Float[np.ndarray, "S S *c"]:
-    """The square crop of ``size`` pixels, 0 outside the image.
+    """Square crop of ``size`` x ``size`` pixels, float32, 0 outside the image. A_crop_img must only scale and shift.
 
-    Enlarged: bilinear. Shrunk: the mean over the area that the crop's pixel covers; both agree at scale 1.
+    Enlarging is bilinear; shrinking averages over the area that a crop pixel covers. Both agree at scale 1.
     """
     height, width = image.shape[:2]
     wy = _axis_weights(height, size=size, scale=A_crop_img[1, 1], shift=A_crop_img[1, 2])
@@ -32,15 +32,15 @@ def resample(
 def warp(
     image: Shaped[np.ndarray, "H W *c"], A_crop_img: Float[np.ndarray, "3 3"], *, size: int
 ) -> Float[np.ndarray, "S S *c"]:
-    """The square crop of ``size`` pixels under any homography, 0 outside the image.
+    """Square crop of ``size`` x ``size`` pixels under any homography, float32, 0 outside the image.
 
-    Enlarged: bilinear, as ``resample``. Shrunk: the mean of n x n bilinear samples spread over the crop's pixel, n the
-    least with no sample more than an image pixel from the next; a touch softer than ``resample``'s mean over the area.
+    Enlarging is bilinear, as in ``resample``. Shrinking averages n x n bilinear samples per crop pixel, with the
+    smallest n that puts samples at most one image pixel apart; slightly softer than ``resample``'s area mean.
     """
     grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2).astype(float)
     A_img_crop = np.linalg.inv(A_crop_img)
     corners = np.array([[-0.5, -0.5], [size - 0.5, -0.5], [-0.5, size - 0.5], [size - 0.5, size - 0.5]])
-    n = int(np.clip(np.ceil(local_zoom(A_img_crop, corners).max() - 1e-6), 1, _FINEST))
+    n = int(np.clip(np.ceil(local_zoom(A_img_crop, corners).max() - 1e-6), 1, _MAX_SAMPLES))
     offsets = (np.arange(n) + 0.5) / n - 0.5
     pixels = np.pad(image.reshape(*image.shape[:2], -1).astype(np.float32), ((2, 2), (2, 2), (0, 0)))
     samples = (
@@ -51,11 +51,11 @@ def warp(
 
 
 def _bilinear(pixels: Float[np.ndarray, "rows columns c"], px: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m c"]:
-    """Values between the four nearest pixels of an image that has two more rows and columns of zeros on each side."""
+    """Values at ``px``, pixels (x, y) of the image without padding; ``pixels`` is padded with 2 zeros on every side."""
     low = np.floor(px)
     x, y = (px - low).astype(np.float32).T[..., None]
     rows, columns, _ = pixels.shape
-    column, row = low.clip(-2, [columns - 4, rows - 4]).astype(np.int64).T + 2  # far away is where two zeros meet
+    column, row = low.clip(-2, [columns - 4, rows - 4]).astype(np.int64).T + 2  # positions far outside clamp to zeros
     flat = pixels.reshape(rows * columns, -1)
     a, b, c, d = (flat.take(row * columns + column + step, axis=0) for step in (0, 1, columns, columns + 1))
     upper, lower = a + x * (b - a), c + x * (d - c)
@@ -63,7 +63,7 @@ def _bilinear(pixels: Float[np.ndarray, "rows columns c"], px: Float[np.ndarray,
 
 
 def _axis_weights(pixels: int, *, size: int, scale: float, shift: float) -> Float[np.ndarray, "size pixels"]:
-    """What each image pixel of an axis gives to each crop pixel."""
+    """Weight of each image pixel in each crop pixel, along one axis."""
     centre = ((np.arange(size) - shift) / scale)[:, None]
     pixel = np.arange(pixels)
     if scale > 1:
@@ -74,5 +74,6 @@ def _axis_weights(pixels: int, *, size: int, scale: float, shift: float) -> Floa
 
 
 def _nonzero_columns(weights: Float[np.ndarray, "size pixels"]) -> slice:
+    """Range of image pixels with a weight."""
     index = np.flatnonzero(weights.any(0))
     return slice(int(index[0]), int(index[-1]) + 1) if len(index) else slice(0, 0)

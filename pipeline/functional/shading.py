@@ -1,4 +1,4 @@
-"""Surface -> colour: normals with creases, textures with mip levels, one headlight. Both renderers shade with these."""
+"""Surface -> colour: normals with creases, mipmapped textures and one headlight. Used by both renderers."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-DEFAULT_GREY = 178  # grey of a mesh without colours, of 255
+DEFAULT_GREY = 178  # grey level (0..255) of a mesh without colours
 
 
 def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Normals as long as twice the face's area."""
+    """Face normals; their length is twice the face's area (mm^2)."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
@@ -19,11 +19,11 @@ def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
 def corner_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease_deg: float
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Unit normals at each face's corners: smooth, but the face's own where the two differ by more than the crease.
+    """Unit normals at each face's corners: smooth, or the face normal where the two differ by more than the crease.
 
-    Smooth is the mean over the faces that touch the corner's position (copies of a vertex on a texture's seam share
-    it), weighted by the angle that each has there (Thürmer, Wüthrich, JGT 1998), so that the diagonals of a quad do
-    not matter. 0 degrees give flat shading, 180 smooth throughout; a box needs less than 45.
+    The smooth normal is the mean over the faces at the corner's position (so copies of a vertex on a texture seam
+    count), weighted by their angle there (Thürmer and Wüthrich, JGT 1998), which makes it independent of how quads are
+    split. ``crease_deg`` 0 gives flat shading, 180 smooth shading everywhere; a box needs less than 45.
     """
     flat = _normalize(face_normals(vertices, faces))
     _, position = np.unique(vertices, axis=0, return_inverse=True)
@@ -31,16 +31,16 @@ def corner_normals(
     weights = (corner_angles(vertices, faces)[..., None] * flat[:, None]).reshape(-1, 3)
     count = int(corner.max()) + 1
     smooth = np.stack([np.bincount(corner.reshape(-1), weights[:, axis], count) for axis in range(3)], axis=-1)
-    at_corner, own = _normalize(smooth)[corner], flat[:, None]
-    agree = (at_corner * own).sum(-1, keepdims=True) >= np.cos(np.radians(crease_deg))
-    return np.where(agree & (crease_deg > 0), at_corner, own)
+    at_corner, of_face = _normalize(smooth)[corner], flat[:, None]
+    is_smooth = (at_corner * of_face).sum(-1, keepdims=True) >= np.cos(np.radians(crease_deg))
+    return np.where(is_smooth & (crease_deg > 0), at_corner, of_face)
 
 
 def corner_angles(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Angles of each face at its corners, radians."""
+    """Interior angles of each face at its corners, radians."""
     corner = vertices[faces]
-    onward, back = _normalize(np.roll(corner, -1, axis=1) - corner), _normalize(np.roll(corner, 1, axis=1) - corner)
-    return np.arccos(np.clip((onward * back).sum(-1), -1, 1))
+    to_next, to_last = _normalize(np.roll(corner, -1, axis=1) - corner), _normalize(np.roll(corner, 1, axis=1) - corner)
+    return np.arccos(np.clip((to_next * to_last).sum(-1), -1, 1))
 
 
 def _normalize(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -55,7 +55,7 @@ def shade(
     ambient: float,
     diffuse: float,
 ) -> Float[np.ndarray, "*n 3"]:
-    """Albedo (ambient + diffuse |cos|): Lambert's law, from both sides. Vectors need not have unit length."""
+    """Colours: albedo (ambient + diffuse |cos|), two-sided Lambert shading. Vectors need not have unit length."""
     cos = np.abs(np.einsum("...c,...c->...", normal, to_light))
     squares = np.einsum("...c,...c->...", normal, normal) * np.einsum("...c,...c->...", to_light, to_light)
     gain = ambient + diffuse * cos / np.sqrt(np.maximum(squares, 1e-30))
@@ -63,7 +63,7 @@ def shade(
 
 
 def mip_levels(texture: UInt8[np.ndarray, "H W 3"]) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
-    """The texture and its halvings (box filter), the finest first, down to 4 pixels."""
+    """Mipmap of a texture, finest level first: halved by a box filter until its shorter side is below 8 pixels."""
     from PIL import Image
 
     levels = [texture]
@@ -78,7 +78,7 @@ def texel_density(
     uv: Float[np.ndarray, "v 2"],
     size_hw: tuple[int, int],
 ) -> Float[np.ndarray, " f"]:
-    """Texels per mm on each face, 0 for a face of no area."""
+    """Texels per mm on each face, 0 for a degenerate face. ``size_hw``: size of the texture."""
     a, b, c = (uv[faces[:, k]] * (size_hw[1], size_hw[0]) for k in range(3))
     texels = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     area = np.linalg.norm(face_normals(vertices, faces), axis=-1)
@@ -88,8 +88,8 @@ def texel_density(
 def texture_colour(
     levels: Sequence[UInt8[np.ndarray, "_ _ 3"]], uv: Float[np.ndarray, "n 2"], texels: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Colours (0..255) at ``uv``, bilinear in the mip level nearest to the samples' width in ``texels``."""
-    # the exponent of sqrt(2) x, less 1, is the integer nearest to log2 x
+    """Colours (0..255) at ``uv``, bilinear within one mip level. ``texels``: width of each sample in texels."""
+    # the nearest level is round(log2 x), which is the exponent of sqrt(2) x minus 1
     level = np.clip(np.frexp(np.maximum(texels, 1.0) * 2**0.5)[1] - 1, 0, len(levels) - 1)
     colour = np.empty((len(uv), 3), dtype=np.float32)
     for k in np.flatnonzero(np.bincount(level)).tolist():
@@ -99,7 +99,7 @@ def texture_colour(
 
 
 def _bilinear(image: UInt8[np.ndarray, "h w 3"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Repeats beyond the borders; v = 0 is the lower edge of the last row."""
+    """Colours at ``uv``; the image repeats beyond its borders, and v = 0 is the lower edge of the last row."""
     h, w = image.shape[:2]
     texels = image.reshape(-1, 3)
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
@@ -113,7 +113,7 @@ def _bilinear(image: UInt8[np.ndarray, "h w 3"], uv: Float[np.ndarray, "n 2"]) -
 
 
 def _wrap(low: Float[np.ndarray, " n"], size: int) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Indices and those after them, beyond the border from the start again."""
+    """Indices ``low`` and ``low + 1``, both modulo ``size``."""
     first = low.astype(np.int64)
     if len(first) and (first.min() < 0 or first.max() >= size):
         first %= size

@@ -1,7 +1,7 @@
-"""Bags of visual words weighted by tf-idf (Sivic and Zisserman, "Video Google", ICCV 2003), softly assigned.
+"""Bags of visual words with tf-idf weights (Sivic and Zisserman, "Video Google", ICCV 2003) and soft assignment.
 
-The weighting is scikit-learn's ``TfidfTransformer(norm="l2", smooth_idf=False, sublinear_tf=False)`` without the 1
-that it adds to every idf: a word that all templates have tells nothing apart and weighs 0.
+The weighting equals scikit-learn's ``TfidfTransformer(norm="l2", smooth_idf=False, sublinear_tf=False)`` without the 1
+that it adds to every idf: a word present in all templates has weight 0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _BLOCK = 1 << 13  # descriptors compared with all words at a time
 def nearest_words(
     points: Float[Tensor, "m d"], words: Float[Tensor, "w d"], *, count: int
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Squared Euclidean distances and indices of each point's k <= ``count`` nearest words, nearest first."""
+    """Squared Euclidean distances to, and indices of, each point's k <= ``count`` nearest words, nearest first."""
     count, lengths = min(count, len(words)), (words * words).sum(1)
     found = [
         torch.topk(torch.addmm(lengths, block, words.T, alpha=-2), count, largest=False)
@@ -30,20 +30,24 @@ def nearest_words(
 
 
 def soft_weights(squared: Float[Tensor, "m k"], *, sigma_squared: float | None) -> Float[Tensor, "m k"]:
-    """What each point gives to its words, rows of length 1: equal parts, or exp(-d^2 / 2 sigma^2).
+    """Weights of each point's words: exp(-d^2 / (2 sigma^2)), or equal without ``sigma_squared``; rows of length 1.
 
-    Philbin et al., "Lost in Quantization", CVPR 2008, section 4; length 1, not sum 1, as FoundPose's code has it.
+    Philbin et al., "Lost in Quantization", CVPR 2008, section 4; normalised to length 1, not sum 1, as in FoundPose's
+    code.
     """
     if sigma_squared is None:
         return l2_normalize(torch.ones_like(squared))
-    nearest = squared.min(1, keepdim=True).values  # shifts the exponent, which the length takes out again
+    nearest = squared.min(1, keepdim=True).values  # avoids underflow; normalisation cancels the shift
     return l2_normalize(torch.exp((nearest - squared) / (2 * sigma_squared)))
 
 
 def word_counts(
     index: Int[Tensor, "m k"], weight: Float[Tensor, "m k"], document: Int[Tensor, " m"], *, documents: int, words: int
 ) -> Float[Tensor, "n w"]:
-    """Term frequencies: what each document's points give to each word, undivided: cosines ignore a factor."""
+    """Term frequencies: sum of the weights that each document's points give each word.
+
+    Not divided by the number of points, since cosines ignore scale.
+    """
     total = torch.zeros(documents * words, dtype=weight.dtype, device=weight.device)
     total.index_add_(0, (document[:, None] * words + index).flatten(), weight.flatten())
     return total.view(documents, words)
@@ -52,7 +56,7 @@ def word_counts(
 def inverse_frequency(
     nearest: Int[Tensor, " m"], document: Int[Tensor, " m"], *, documents: int, words: int
 ) -> Float[Tensor, " w"]:
-    """ln(n / n_w), n_w the documents (at least 1) in which word w is some point's nearest."""
+    """Inverse document frequency ln(n / n_w), n_w the number of documents (at least 1) with a point nearest to w."""
     present = torch.zeros(documents, words, dtype=torch.bool, device=nearest.device)
     present[document, nearest] = True
     return torch.log(documents / present.sum(0).clamp(min=1).float())

@@ -1,4 +1,4 @@
-"""Viewpoint sets: rotations R_cam_obj of the cameras that templates are rendered from."""
+"""Viewpoint sets: rotations R_cam_obj of the cameras from which templates are rendered."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pipeline.functional.rigid import look_at
 ViewpointSet = Literal["icosphere_upper", "icosphere", "fibonacci", "superfibonacci"]
 
 _LEVEL = 2  # the paper's icosphere: 642 directions, 301 of them above the horizon
-_GOLDEN = (1 + 5**0.5) / 2
+_GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 
 def viewpoint_rotations(name: ViewpointSet, n: int, inplane: int = 1) -> Float[np.ndarray, "n 3 3"]:
-    """R_cam_obj of a named set, each direction repeated at ``inplane`` equal turns about the optical axis.
+    """R_cam_obj of a named set, each repeated at ``inplane`` equal rotations about the optical axis.
 
-    ``icosphere_upper``: the 301 level-2 directions with z > 0; ``icosphere``: all 642 (``n`` plays no part in
-    either); ``fibonacci``: ``n`` directions; ``superfibonacci``: ``n`` rotations. Repeats of a view stand together.
+    ``icosphere_upper``: the 301 level-2 directions with z > 0; ``icosphere``: all 642 (both ignore ``n``);
+    ``fibonacci``: ``n`` directions; ``superfibonacci``: ``n`` rotations. Repeats of a view are consecutive.
     """
     if name == "superfibonacci":
         R = superfibonacci(n)
@@ -30,24 +30,24 @@ def viewpoint_rotations(name: ViewpointSet, n: int, inplane: int = 1) -> Float[n
 
 
 def add_inplane_turns(R_cam_obj: Float[np.ndarray, "n 3 3"], turns: int) -> Float[np.ndarray, "m 3 3"]:
-    """Every rotation at ``turns`` equal turns about the camera's optical axis, m = n turns, the unturned one first."""
+    """Each rotation at ``turns`` equal angles about the camera's optical axis, angle 0 first; m = n * turns."""
     angle = 2 * np.pi * np.arange(turns) / turns
     c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros(turns), np.ones(turns)
-    R_turned_cam = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
-    return (R_turned_cam[None] @ R_cam_obj[:, None]).reshape(-1, 3, 3)
+    R_inplane = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+    return (R_inplane[None] @ R_cam_obj[:, None]).reshape(-1, 3, 3)
 
 
 def icosphere(level: int) -> Float[np.ndarray, "n 3"]:
-    """Unit vertices of an icosahedron whose edges are halved level + 1 times: 42, 162, 642 for levels 0, 1, 2.
+    """Unit vertices of an icosahedron subdivided level + 1 times: 42, 162, 642 for levels 0, 1, 2.
 
-    A corner lies on +z (the orientation Blender gives an icosphere); level 2 then has 40 vertices on the horizon and
-    301 above it. In the orientation of golden rectangles there would be 32 on it and 305 above.
+    One vertex lies on +z, as in Blender's icosphere; level 2 then has 40 vertices on the horizon and 301 above it (the
+    golden-rectangle orientation would have 32 and 305).
     """
     return icosphere_mesh(level)[0]
 
 
 def icosphere_mesh(level: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and outward-wound faces of ``icosphere(level)``."""
+    """Vertices and faces (wound outwards) of ``icosphere(level)``."""
     points, faces = _icosahedron()
     for _ in range(level + 1):
         points, faces = _halve_edges(points, faces)
@@ -55,13 +55,13 @@ def icosphere_mesh(level: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray
 
 
 def fibonacci(n: int) -> Float[np.ndarray, "n 3"]:
-    """N unit directions on a golden spiral: latitudes of equal area, longitudes a golden angle apart.
+    """N unit directions on a Fibonacci lattice: latitudes of equal area, longitudes a golden angle apart.
 
-    Gonzalez, Mathematical Geosciences 2010; half a step from the poles.
+    Gonzalez, Mathematical Geosciences 2010; the first and last latitudes are half a step from the poles.
     """
     i = np.arange(n)
     z = 1 - (2 * i + 1) / n
-    longitude = 2 * np.pi * i / _GOLDEN
+    longitude = 2 * np.pi * i / _GOLDEN_RATIO
     radius = np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(longitude), radius * np.sin(longitude), z], axis=-1)
 
@@ -87,7 +87,7 @@ def _quaternion_rotation(
 
 
 def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
-    """Poles on the z axis, two rings of five at z = +-1/sqrt(5), the lower one turned by 36 degrees."""
+    """Poles on the z axis and two rings of five vertices at z = +-1/sqrt(5), the lower one rotated by 36 degrees."""
     ring = 2 * np.pi * np.arange(5) / 5
     z, radius = 1 / 5**0.5, 2 / 5**0.5
     upper = np.stack([radius * np.cos(ring), radius * np.sin(ring), np.full(5, z)], axis=-1)
@@ -107,11 +107,11 @@ def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
 def _halve_edges(
     points: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """Each triangle in four; edge midpoints, pushed out to the unit sphere, follow the old points."""
+    """Each triangle split into four; edge midpoints, projected to the unit sphere, are appended to the points."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
     unique, where = np.unique(edges, axis=0, return_inverse=True)
     middle = points[unique].sum(axis=1)
-    middle[np.abs(middle[:, 2]) < 1e-12, 2] = 0.0  # the horizon is exact, not a matter of rounding
+    middle[np.abs(middle[:, 2]) < 1e-12, 2] = 0.0  # put the horizon exactly at z = 0
     middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
     ab, bc, ca = (len(points) + where.reshape(-1, 3)).T
     a, b, c = faces.T
