@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -11,11 +12,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from pipeline.fits import Fit, Fitted
 from pipeline.functional import rigid
+from pipeline.functional.similarity import map_norms
 from pipeline.graph.context import stack_crops
+from pipeline.items.features import CropFeatures, FittedArrays
+from pipeline.items.fit import Fit
+from pipeline.items.online import Query, TemplateView
 from pipeline.items.views import Crops, Geometry
-from pipeline.route import Query, TemplateView
 from pipeline.spec import Runtime
 from pipeline.stages.crop.square import Square
 from pipeline.stages.extract.coordinates import Coordinates
@@ -43,6 +46,11 @@ class Bank:
     T_cam_obj: Float[np.ndarray, "n 4 4"]
     views: tuple[TemplateView, ...]
 
+    @cached_property
+    def norms(self) -> Float[Tensor, " n"]:
+        """Lengths of the flattened maps."""
+        return map_norms(self.features)
+
     def view(self, index: int) -> TemplateView:
         """Everything about one template."""
         return self.views[index]
@@ -53,7 +61,7 @@ class Bank:
         """Nothing is drawn here."""
         raise NotImplementedError
 
-    def fitted(self, fit: Fit) -> Fitted:
+    def fitted(self, fit: Fit) -> FittedArrays:
         """Nothing is fitted here."""
         raise NotImplementedError(fit.kind)
 
@@ -84,15 +92,13 @@ def scene(shapes: Mapping[int, tuple[int, int]], *, device: str = "cpu", views: 
     crops = Crops(**stack_crops([crop(rgb, depth > 0, whole, K) for depth in depth_mm]), geometry=geometry)
     maps = {layer: m.to(device) for layer, m in _mixed(crops, shapes, seed=seed).items()}
     masks = torch.from_numpy(crops.mask).to(device)
-    each = [{layer: m[i] for layer, m in maps.items()} for i in range(len(poses))]
-    template = tuple(
-        TemplateView(each[i], masks[i], crops.A_crop_img[i], depth_mm[i], K, poses[i]) for i in range(1, len(poses))
-    )
+    each = [CropFeatures({layer: m[i] for layer, m in maps.items()}, masks[i]) for i in range(len(poses))]
+    template = tuple(TemplateView(each[i], crops.A_crop_img[i], depth_mm[i], K, poses[i]) for i in range(1, len(poses)))
     generator = torch.Generator().manual_seed(seed)
     others = torch.randn((TEMPLATES - views, *maps[2].shape[1:]), generator=generator).half().to(device)
     bank_mask = torch.cat([masks[1:], masks[1:2].expand(TEMPLATES - views, -1, -1)])
     bank = Bank(torch.cat([maps[2][1:], others]), bank_mask, T_cam_obj, template)
-    return Scene(Query(each[0], masks[0], crops.A_crop_img[0], K), bank, T_true)
+    return Scene(Query(each[0], crops.A_crop_img[0], K), bank, T_true)
 
 
 def _mixed(crops: Crops, shapes: Mapping[int, tuple[int, int]], *, seed: int) -> dict[int, Tensor]:

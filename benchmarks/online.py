@@ -45,7 +45,7 @@ def steps(made: Scene) -> dict[str, dict[str, Callable[[], object]]]:
     """Step -> ours and the reference's, on the same inputs."""
     query, bank = made.query, made.bank
     template = bank.view(0)
-    pair = PAPER.fuse(query.features, template.features, query.mask, template.mask)
+    pair = PAPER.fuse(query.crop, template.crop)
     clusters = PAPER.cluster(pair)
     matches = PAPER.correspond(pair, clusters, crop_size=PAPER.crop.size)
     cells = l2_normalize(pair.query.float().flatten(1).T[foreground(pair.query_mask)]).contiguous()
@@ -53,16 +53,16 @@ def steps(made: Scene) -> dict[str, dict[str, Callable[[], object]]]:
     plain = Plain(made)
     labels = clusters.query_label.cpu().numpy(), clusters.template_label.cpu().numpy(), clusters.pairs.cpu().numpy()
     maps = pair.query.cpu().numpy(), pair.template.cpu().numpy()
-    masks = cell_mask(template.mask, cells=64).cpu().numpy()
+    masks = cell_mask(template.crop.mask, cells=64).cpu().numpy()
     points_np = cells.cpu().numpy()
     assert len(matches.similarity)
     return {
         "retrieval": {
-            "match": lambda: PAPER.match(query.features[2], query.mask, bank.features, bank.mask),
+            "match": lambda: PAPER.match(query, bank),
             "plain match": lambda: reference.retrieve(plain.query[2], plain.bank),
         },
         "co-PCA": {
-            "fuse": lambda: PAPER.fuse(query.features, template.features, query.mask, template.mask),
+            "fuse": lambda: PAPER.fuse(query.crop, template.crop),
             "plain fuse": lambda: reference.co_project(
                 plain.query, plain.view(0)[0], plain.query_mask, plain.view(0)[1], dims=plain.dims
             ),
@@ -106,16 +106,16 @@ class Plain:
 
     def __init__(self, made: Scene) -> None:
         self.made, query = made, made.query
-        self.query = {layer: m.float().cpu().numpy() for layer, m in query.features.items()}
-        self.query_mask = query.mask.cpu().numpy()
+        self.query = {layer: m.float().cpu().numpy() for layer, m in query.crop.maps.items()}
+        self.query_mask = query.crop.mask.cpu().numpy()
         self.bank = made.bank.features.float().cpu().numpy()
         self.dims = dict(zip(FUSE.layers, FUSE.dims(), strict=True))
 
     def view(self, index: int) -> reference.View:
         """A template, unpacked."""
         t = self.made.bank.view(index)
-        features = {layer: m.float().cpu().numpy() for layer, m in t.features.items()}
-        return features, t.mask.cpu().numpy(), t.A_crop_img, t.depth_mm, t.K, t.T_cam_obj
+        features = {layer: m.float().cpu().numpy() for layer, m in t.crop.maps.items()}
+        return features, t.crop.mask.cpu().numpy(), t.A_crop_img, t.depth_mm, t.K, t.T_cam_obj
 
     def pose(self) -> tuple[int, np.ndarray]:
         """The reference's template and pose."""

@@ -1,6 +1,6 @@
 """A complete set of stages that benchmarks and tests start from; change fields with ``dataclasses.replace``."""
 
-from pipeline.route import Stages
+from pipeline.method import Stages
 from pipeline.stages.choose.inliers import Inliers
 from pipeline.stages.cluster.kmeans import KMeans
 from pipeline.stages.correspond.cosine import Cosine as Corresponder

@@ -12,8 +12,9 @@ from pydantic.dataclasses import is_pydantic_dataclass
 
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import NotDownloaded
+from pipeline.method import Stages
 from pipeline.options import Evaluate, Options, Select
-from pipeline.route import SecondLook, Stages
+from pipeline.route import SecondLook
 from pipeline.spec import build
 
 PACKAGE = Path(__file__).resolve().parent

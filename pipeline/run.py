@@ -17,6 +17,7 @@ from pipeline.io.checkpoints import NotDownloaded
 from pipeline.io.digests import DigestCache, use_digest_cache
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
+from pipeline.method import Stages
 from pipeline.options import Options
 from pipeline.outputs.files import errors_by_answer, places_text, write_computed_detections, write_files
 from pipeline.outputs.folder import OutputFolder
@@ -26,7 +27,6 @@ from pipeline.progress import Progress
 from pipeline.report.run_records import read_run_records
 from pipeline.report.scores import scores_table
 from pipeline.report.summary import answers_table, failures_table, objects_table
-from pipeline.route import Stages
 from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
 from pipeline.store import Store

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from array_bank import match, query_of
 from command import Ran, run_dzop
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -95,7 +96,8 @@ def test_a_stored_fit_is_the_fit_made_here_and_now(tmp_path):
     kept = bank.fitted(chosen.match.fit)
     assert set(kept) == {"mean", "axes", "words", "idf", "templates"}
     query, mask = bank.features[7].float(), bank.mask[7]
-    here, stored = chosen.match(query, mask, bank.features, bank.mask), chosen.match.by_fitted(query, mask, kept)
+    here = match(chosen.match, query, mask, bank.features, bank.mask)
+    stored = chosen.match(query_of(chosen.match.layer, query, mask), bank)
     assert here.index.tolist() == stored.index.tolist()
     assert here.score.tolist() == stored.score.tolist()
     assert stored.index.tolist()[0] == 7

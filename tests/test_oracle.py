@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from array_bank import ArrayBank
 
 from benchmarks.presets import PAPER
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
 from pipeline.graph import Context, Graph
+from pipeline.items.features import CropFeatures
+from pipeline.items.online import Query, TemplateView
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Crops, Geometry
-from pipeline.route import Query, TemplateView, trace_pose
+from pipeline.route import trace_pose
 from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
 from pipeline.stages.cluster.one import One
@@ -98,21 +101,19 @@ def magnified_query(factor: int, crop_stage: Square | Virtual = FULL.crop) -> tu
         K_view = camera.resize_affine(float(times)) @ K
         picture, depth = (np.repeat(np.repeat(image[0], times, 0), times, 1) for image in (rgb, depth_mm))
         whole = (-0.5, -0.5, depth.shape[1] - 0.5, depth.shape[0] - 0.5)
-        crop, mask, A_crop_img = crop_stage(picture, depth > 0, whole, K_view)
-        crops = Crops(crop[None], mask[None], A_crop_img[None], Geometry([depth], K_view[None], T_cam_obj[:1]))
+        crop = crop_stage(picture, depth > 0, whole, K_view)
+        crops = Crops(
+            crop.rgb[None], crop.mask[None], crop.A_crop_img[None], Geometry([depth], K_view[None], T_cam_obj[:1])
+        )
         maps = {layer: m[0] for layer, m in backbone(crops, FULL.layers).items()}
-        views.append((maps, torch.from_numpy(mask), A_crop_img, K_view))
-    return Query(*views[1]), TemplateView(*views[0][:3], depth_mm=depth_mm[0], K=K, T_cam_obj=T_cam_obj[0])
+        views.append((CropFeatures(maps, torch.from_numpy(crop.mask)), crop.A_crop_img, K_view))
+    template = TemplateView(*views[0][:2], depth_mm=depth_mm[0], K=K, T_cam_obj=T_cam_obj[0])
+    return Query(*views[1]), template
 
 
-class OneTemplate:
+def bank_of_one(view: TemplateView) -> ArrayBank:
     """A bank of a single view."""
-
-    def __init__(self, view: TemplateView) -> None:
-        self.features, self.mask, self._view = view.features[FULL.match.layer][None], view.mask[None], view
-
-    def view(self, index: int) -> TemplateView:
-        return self._view
+    return ArrayBank(view.crop.maps[FULL.match.layer][None], view.crop.mask[None], views=(view,))
 
 
 @pytest.mark.parametrize("plane", ["image", "crop"])
@@ -124,7 +125,7 @@ def test_a_query_magnified_by_three_against_its_own_template_comes_back_within_a
     query, template = magnified_query(3, crop)
     changes = {"crop": crop, "correspond": Corresponder(kernel=subpixel), "solve": Epnp(plane=plane)}
     stages = replace(FULL, **changes)
-    best = trace_pose(stages, query, OneTemplate(template)).best
+    best = trace_pose(stages, query, bank_of_one(template)).best
     assert best.solution is not None
     points = best.points_obj[np.isfinite(best.points_obj).all(1)]
     found, true = (
@@ -137,14 +138,14 @@ def test_a_query_magnified_by_three_against_its_own_template_comes_back_within_a
 class Shifted(NoRefinement):
     """A refiner that moves whatever it is given by 3 mm."""
 
-    def __call__(self, T_cam_obj, pair, points_obj, K_crop, *, crop_size):
+    def __call__(self, T_cam_obj, geometry):
         return rigid.rigid(np.eye(3), np.array([3.0, 0, 0])) @ T_cam_obj
 
 
 def test_the_refined_pose_is_answered_with_the_solvers_inliers_and_its_own_reprojection():
     query, template = magnified_query(2)
     plain, shifted = (
-        trace_pose(replace(FULL, refine=refine), query, OneTemplate(template)) for refine in (NoRefinement(), Shifted())
+        trace_pose(replace(FULL, refine=refine), query, bank_of_one(template)) for refine in (NoRefinement(), Shifted())
     )
     before, after = plain.best.solution, shifted.best.solution
     assert before is not None

@@ -15,11 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from array_bank import match, match_truth
 from make_vit import write_vit
 from test_configuration import VARIANTS, loaded
 
+from pipeline.fits import fit_arrays, foreground_cells
 from pipeline.functional import camera, rigid
-from pipeline.items.features import Clusters, FusedPair
+from pipeline.items.features import Clusters, CropFeatures, FusedPair, PairGeometry
+from pipeline.items.matches import TrueMatches
 from pipeline.items.views import Crops, Geometry
 from pipeline.spec import Runtime, build, digest
 
@@ -78,10 +81,19 @@ def disc(size: int) -> torch.Tensor:
     return (x - size / 2) ** 2 + (y - size / 2.2) ** 2 < (0.4 * size) ** 2
 
 
-def toy_pair() -> FusedPair:
-    fused = variant("fuse/concat")(
-        toy_maps(), {k: m.flip(-1) for k, m in toy_maps().items()}, disc(64), disc(64).flip(-1)
+def toy_pair(fuse=None) -> FusedPair:
+    query = CropFeatures(toy_maps(), disc(64))
+    template = CropFeatures({k: m.flip(-1) for k, m in toy_maps().items()}, disc(64).flip(-1))
+    if fuse is None:
+        return with_saliency(variant("fuse/concat")(query, template))
+    fit = fuse.fit
+    arrays = (
+        {} if fit is None else fit_arrays(fit, foreground_cells(template.maps[fit.layer][None], template.mask[None]))
     )
+    return fuse(query, template, arrays)
+
+
+def with_saliency(fused: FusedPair) -> FusedPair:
     ramp = torch.linspace(0, 1, fused.query.shape[-1])
     salient = 0.7 * ramp + 0.3 * ramp[:, None]
     return replace(fused, query_saliency=salient, template_saliency=salient.flip(-1))
@@ -112,18 +124,18 @@ def summary(name: str) -> list[float]:
     stage, spec = name.split("/")[0], variant(name)
     if name == "match/oracle":
         views = rigid.look_at(np.random.default_rng(RNG_SEED).normal(size=(40, 3)) * 300)
-        found = spec.by_truth(views[7] @ rigid.look_at(np.array([[9.0, 3, 3]]))[0], np.eye(4)[None], views)
+        found = match_truth(spec, views[7] @ rigid.look_at(np.array([[9.0, 3, 3]]))[0], np.eye(4)[None], views)
         return [*found.index.tolist(), *found.score.tolist(), found.margin]
     if name == "correspond/oracle":
         px = torch.arange(40, dtype=torch.float64).reshape(20, 2) * 1.6
-        found = spec.by_truth(px, px + 0.25, disc(64))
+        found = spec(toy_pair(), None, crop_size=64, truth=TrueMatches(px, px + 0.25, disc(64)))
         return [float(len(found.similarity)), *found.query_px[:3].flatten().tolist()]
     if stage == "match":
         bank = toy_maps(9)[spec.layer]
-        found = spec(toy_maps()[spec.layer] + bank[3], disc(64), bank, disc(64).expand(9, 64, 64))
+        found = match(spec, toy_maps()[spec.layer] + bank[3], disc(64), bank, disc(64).expand(9, 64, 64))
         return [*found.index.tolist(), *found.score.tolist(), found.margin]
     if stage == "fuse":
-        pair = spec(toy_maps(), {k: m.flip(-1) for k, m in toy_maps().items()}, disc(64), disc(64).flip(-1))
+        pair = toy_pair(spec)
         # axes of nearly equal variance may turn into one another, which leaves products as they are
         inner = torch.einsum("dhw,dhw->hw", pair.query, pair.template)
         return [float(len(pair.query)), *inner[4:12:3, 4:12:3].flatten().tolist()]
@@ -143,14 +155,14 @@ def summary(name: str) -> list[float]:
         x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
         points, K_crop = np.stack([x, y, 0 * x], axis=1), np.array([[-400.0, 0, 31.5], [0, 400.0, 31.5], [0, 0, 1]])
         poses = [rigid.rigid(np.eye(3), np.array([shift, 0.0, 400.0])) for shift in (0.0, 3.0, 9.0)]
-        return [spec(T, 25, pair, points, K_crop, crop_size=64) for T in poses]
+        return [spec(T, 25, PairGeometry(pair, points, K_crop, 64)) for T in poses]
     if stage == "refine":
         pair = toy_pair()
         x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
         bumps = np.random.default_rng(RNG_SEED).uniform(-5, 5, len(x))
         start = rigid.rigid(np.eye(3), np.array([1.0, -0.6, 404.0]))
         K_crop = np.array([[-400.0, 0, 31.5], [0, 400.0, 31.5], [0, 0, 1]])  # the query mirrors the template
-        found = spec(start, pair, np.stack([x, y, bumps], axis=1), K_crop, crop_size=64)
+        found = spec(start, PairGeometry(pair, np.stack([x, y, bumps], axis=1), K_crop, 64))
         return [float(np.array_equal(found, start)), *found[:3].round(4).flatten().tolist()]
     if stage == "crop":
         rgb = toy_crops().rgb[0]

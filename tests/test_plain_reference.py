@@ -28,17 +28,17 @@ def plain(made):
 @pytest.fixture(scope="module")
 def pair(made):
     template = made.bank.view(0)
-    return PAPER.fuse(made.query.features, template.features, made.query.mask, template.mask)
+    return PAPER.fuse(made.query.crop, template.crop)
 
 
 @pytest.mark.parametrize("cells", [8, 16, 32, 64])
 def test_cells_inside_a_mask_are_the_references(made, cells):
-    ours = cell_mask(made.query.mask, cells=cells).numpy()
-    np.testing.assert_array_equal(ours, reference.cell_mask(made.query.mask.numpy(), cells))
+    ours = cell_mask(made.query.crop.mask, cells=cells).numpy()
+    np.testing.assert_array_equal(ours, reference.cell_mask(made.query.crop.mask.numpy(), cells))
 
 
 def test_similarities_of_all_templates_are_the_references(made, plain):
-    ours = global_cosine(made.query.features[2], made.bank.features).numpy()
+    ours = global_cosine(made.query.crop.maps[2], made.bank.features).numpy()
     # float32 sums of 6,144 products
     np.testing.assert_allclose(ours, reference.retrieve(plain.query[2], plain.bank), atol=1e-5)
 

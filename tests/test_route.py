@@ -8,14 +8,16 @@ import torch
 
 from benchmarks.presets import PAPER
 from pipeline.functional import camera, rigid
-from pipeline.route import Query, TemplateView, _solved, template_pose
+from pipeline.items.features import CropFeatures
+from pipeline.items.online import Query, TemplateView
+from pipeline.route import Route, template_pose
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.stages.solve.poselib import Poselib
 
 K = np.array([[600.0, 0.0, 310.0], [0.0, 580.0, 250.0], [0.0, 0.0, 1.0]])
 T = rigid.rigid(rigid.look_at(np.array([300.0, 200.0, 250.0]))[:3, :3], np.array([250.0, -120.0, 700.0]))
 BOX = (480.0, 90.0, 580.0, 200.0)
-MASK = torch.ones(8, 8, dtype=torch.bool)
+NOTHING = CropFeatures({}, torch.ones(8, 8, dtype=torch.bool))
 CROPS = {
     "square": camera.square_crop(BOX, size=128, padding_ratio=1.2),
     "virtual": camera.virtual_crop(BOX, K, size=128, padding_ratio=1.2),
@@ -27,7 +29,8 @@ def solved(solve: Epnp | Poselib, A_crop_img: np.ndarray, *, noise_px: float = 0
     px = camera.project(K, rigid.transform(T, points)) + noise_px * np.random.default_rng(1).normal(size=(80, 2))
     seen = np.ones(80, bool)
     seen[::9] = False
-    return _solved(replace(PAPER, solve=solve), Query({}, MASK, A_crop_img, K), points, px, seen), seen, points, px
+    route = Route(replace(PAPER, solve=solve), Query(NOTHING, A_crop_img, K), bank=None)
+    return route.solve_pose(np.where(seen[:, None], points, np.nan), px), seen, points, px
 
 
 @pytest.mark.parametrize("crop", CROPS)
@@ -52,7 +55,7 @@ def test_a_threshold_in_the_crop_is_of_crop_pixels_and_the_error_of_image_pixels
 
 
 def view(A_crop_img: np.ndarray, T_cam_obj: np.ndarray) -> TemplateView:
-    return TemplateView({}, MASK, A_crop_img, np.zeros((4, 4)), K, T_cam_obj)
+    return TemplateView(NOTHING, A_crop_img, np.zeros((4, 4)), K, T_cam_obj)
 
 
 def test_a_template_that_looks_the_same_in_a_turned_camera_gives_the_turned_pose():
@@ -60,7 +63,7 @@ def test_a_template_that_looks_the_same_in_a_turned_camera_gives_the_turned_pose
     K_virtual = np.array([[900.0, 0.0, 63.5], [0.0, 900.0, 63.5], [0.0, 0.0, 1.0]])
     turn = rigid.rotation_between(np.array([0.0, 0, 1]), np.array([0.4, -0.2, 1.0]))
     A_query, A_template = K_virtual @ turn.T @ np.linalg.inv(K), K_virtual @ np.linalg.inv(K)
-    found = template_pose(Query({}, MASK, A_query, K), view(A_template, T_template))
+    found = template_pose(Query(NOTHING, A_query, K), view(A_template, T_template))
     expected = rigid.rigid(turn @ T_template[:3, :3], turn @ T_template[:3, 3])
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
@@ -68,7 +71,7 @@ def test_a_template_that_looks_the_same_in_a_turned_camera_gives_the_turned_pose
 def test_a_template_in_a_square_crop_keeps_its_place_and_its_size():
     T_template = rigid.rigid(T[:3, :3], np.array([3.0, -5.0, 700.0]))
     A_template = camera.square_crop((250.0, 200.0, 370.0, 300.0), size=128, padding_ratio=1.2)
-    found = template_pose(Query({}, MASK, CROPS["square"], K), view(A_template, T_template))
+    found = template_pose(Query(NOTHING, CROPS["square"], K), view(A_template, T_template))
     at = [
         camera.apply_homography(A, camera.project(K, pose[:3, 3]))
         for A, pose in ((A_template, T_template), (CROPS["square"], found))

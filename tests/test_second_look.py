@@ -74,11 +74,11 @@ def test_a_drawn_view_shows_the_object_where_the_querys_crop_would(scenes, cache
     A = square if isinstance(crop, Square) else camera.virtual_crop(box, K, size=size, padding_ratio=1.2)
     drawn = made.templates.bank(gt.obj_id).draw(gt.T_cam_obj, A, K)
     assert drawn.rgb.shape == (size, size, 3)
-    assert drawn.rgb[drawn.mask.numpy()].any(axis=1).mean() > 0.95
-    assert {layer: tuple(maps.shape) for layer, maps in drawn.features.items()} == {
+    assert drawn.rgb[drawn.crop.mask.numpy()].any(axis=1).mean() > 0.95
+    assert {layer: tuple(maps.shape) for layer, maps in drawn.crop.maps.items()} == {
         layer: made.context.stages.extract.feature_shape(layer) for layer in made.context.stages.layers
     }
-    crop_px = camera.grid_xy(foreground(drawn.mask), width=size).double().numpy()
+    crop_px = camera.grid_xy(foreground(drawn.crop.mask), width=size).double().numpy()
     points = lift(crop_px, drawn.A_crop_img, drawn.depth_mm, drawn.K, drawn.T_cam_obj)
     seen = np.isfinite(points).all(1)
     assert seen.mean() > 0.8  # the rest lies across the outline, where depth is of two surfaces
@@ -102,7 +102,7 @@ def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes,
         traced = made.retracer()(answers[0])
         assert traced is not None
         np.testing.assert_array_equal(traced.hypothesis.solution.T_cam_obj, answers[0].T_cam_obj)
-        assert (traced.hypothesis.drawn is not None) == (looks > 0)
+        assert (traced.hypothesis.rerendered is not None) == (looks > 0)
     assert errors[2] < 0.8 * errors[0], errors
 
 
@@ -119,34 +119,32 @@ def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache
     query, bank = made.poses.query(found[0])[0], made.templates.bank(found[0].detection.obj_id)
     behind = rigid.rigid(np.eye(3), np.array([0.0, 0.0, -500.0]))
     nothing = bank.draw(behind, query.A_crop_img, query.K)
-    assert not nothing.mask.any()
+    assert not nothing.crop.mask.any()
     kept = trace_pose(made.context.stages, query, replace(bank, draw=lambda *pose: nothing)).best
     first = trace_pose(replace(made.context.stages, second_look=0), query, bank).best
-    assert kept.drawn is None
+    assert kept.rerendered is None
     np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)
 
 
-def test_a_side_is_clustered_once_where_the_other_has_no_say(scenes, cache, monkeypatch):
+def test_maps_that_are_encoded_independently_are_clustered_once(scenes, cache, monkeypatch):
     chosen = {"extract": Embedded(), "match": MaskedCosine(top_k=3), "fuse": Learned(), "cluster": KMeans(count=30)}
     made = graph(scenes, cache, render=Raycast(viewpoints="superfibonacci", count=12), **chosen)
     made.onboard()
     found = made.queries.make_crops(scenes.images[0])
     made.queries.make_features(scenes.images[0], found)
     query, bank = made.poses.query(found[0])[0], made.templates.bank(found[0].detection.obj_id)
-    asked, side = [], KMeans.side
-    monkeypatch.setattr(KMeans, "side", lambda self, name, *maps: asked.append(name) or side(self, name, *maps))
+    calls, encode = [], KMeans.encode
+    monkeypatch.setattr(KMeans, "encode", lambda self, *maps: calls.append(0) or encode(self, *maps))
     trace = trace_pose(made.context.stages, query, bank)
-    looks = sum(hypothesis.drawn is not None for hypothesis in trace.hypotheses)
-    assert asked.count("query") == 1
-    assert asked.count("template") == 3 + looks
-    trace_pose(made.context.stages, replace(query), bank)  # another query that meets the same templates
-    assert asked.count("query") == 2
-    assert asked.count("template") == 3 + 2 * looks
+    looks = sum(hypothesis.rerendered is not None for hypothesis in trace.hypotheses)
+    assert len(calls) == 1 + 3 + looks  # the query, the templates, the rerendered views
+    trace_pose(made.context.stages, replace(query), bank)  # another query that is matched with the same templates
+    assert len(calls) == 2 + 3 + 2 * looks
     other = replace(made.context.stages, cluster=KMeans(count=10))  # other clusters are none of those
     assert trace_pose(other, query, bank).best.clusters.query_label.max() == 9
     for hypothesis in trace.hypotheses:
-        view = hypothesis.drawn or bank.view(hypothesis.template_id)
-        pair = Learned()(query.features, view.features, query.mask, view.mask)
+        view = hypothesis.rerendered or bank.view(hypothesis.template_id)
+        pair = Learned()(query.crop, view.crop)
         assert torch.equal(pair.query, hypothesis.pair.query)
         assert torch.equal(pair.template, hypothesis.pair.template)
         clusters = KMeans(count=30)(pair)

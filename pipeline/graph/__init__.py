@@ -39,7 +39,6 @@ from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
-from pipeline.stages.fuse import TrainedFuser
 
 __all__ = [
     "KEY_DIGITS",
@@ -73,8 +72,7 @@ class Graph:
         self.context.runtime.torch_device()
         _ = self.context.runtime.memory_bytes, self.context.runtime.vram_bytes
         stages = self.context.stages
-        if isinstance(stages.fuse, TrainedFuser):
-            stages.fuse.check(stages.extract.model)
+        stages.fuse.check(stages.extract.model)
         asked = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
         asked[stages.match.layer] = "match.layer"
         for layer in stages.layers:

@@ -18,8 +18,8 @@ from pipeline.graph.tasks import Advance, Item, Task, Workers
 from pipeline.graph.timings import Timings, timing_key
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crop, Crops, Target
+from pipeline.method import Stages
 from pipeline.progress import Progress
-from pipeline.route import Stages
 from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
 from pipeline.store import Layout, Ref, Store, make_ref

@@ -18,7 +18,6 @@ from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.templates import DRAWN_LARGER
 from pipeline.progress import format_bytes
-from pipeline.stages.match import FittedMatcher, TruthMatcher
 
 VIEWS_BYTES = 256 << 20  # of whole templates, kept for the next query of their object, where there is a budget
 VIEWS_MOST = 64
@@ -102,12 +101,13 @@ def need_of(context: Context, described: ProposalNodes | None) -> Need:
     crop = size * size
     finest = max((shapes[layer][1] ** 2 for layer in stages.fuse.layers), default=0)
     cells = {layer: shapes[layer][1] * shapes[layer][2] for layer in shapes}
-    if isinstance(stages.match, FittedMatcher):
+    if stages.match.fit is not None:
         bank = sum(fit.array_bytes(shapes[fit.layer][0], n) for fit in stages.fits)
-    elif isinstance(stages.match, TruthMatcher):
+    elif stages.match.needs_truth:
         bank = 0
     else:
         bank = n * (2 * values[stages.match.layer] + crop + 24 * cells[stages.match.layer])
+    encoded = 0 if stages.fuse.joint else 4 * finest * sum(shapes[layer][0] for layer in stages.fuse.layers)
     footprint, weights, unknown = _extracting(context, described)
     return Need(
         rows=n,
@@ -117,7 +117,7 @@ def need_of(context: Context, described: ProposalNodes | None) -> Need:
         + _CROPS_CUT * (8 * h * w + 4 * crop),
         fits=max((3 * n * values[fit.layer] for fit in stages.fits), default=0),
         bank=bank,
-        view=2 * sum(values.values()) + crop + 4 * h * w,
+        view=2 * sum(values.values()) + encoded + crop + 4 * h * w,
         online=16 * finest * sum(shapes[layer][0] for layer in stages.fuse.layers),
         look=DRAWN_LARGER**2 * crop * (8 + 2 * _RAY_BYTES) if stages.second_look else 0,
         unknown=unknown,

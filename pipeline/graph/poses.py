@@ -13,10 +13,12 @@ from pipeline.graph.queries import Found, QueryNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.graph.timings import timing_key
+from pipeline.items.online import Query, Trace, Truth
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
-from pipeline.route import ONLINE_STAGES, Query, Trace, Truth, template_pose, trace_pose
+from pipeline.method import ONLINE_STAGES
+from pipeline.route import template_pose, trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
@@ -59,7 +61,7 @@ class PoseNodes:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.context.K(image).tolist()]
             asked += [self.queries.detecting.identity(d) for _, d in self._detections(target)]
-            if stages.need_truth:
+            if stages.oracle:
                 asked += [self._truth(d).T_cam_obj.tolist() for _, d in self._detections(target)]
                 asked += [self.context.model(obj_id).symmetries.tolist()]
             features = [self.queries.features(image, layer).key for layer in stages.layers]
@@ -150,12 +152,12 @@ class PoseNodes:
     def query(self, found: Found) -> tuple[Query, dict[str, float]]:
         """A detection as the online route reads it, with the truth for an oracle alone; its share of the seconds."""
         query, shared_s = self.queries.query(found)
-        if self.context.stages.need_truth:
+        if self.context.stages.oracle:
             query = replace(query, truth=self._truth(found.detection))
         return query, shared_s
 
     def _truth(self, d: Detection) -> Truth:
-        T_cam_obj = self.queries.true_pose(d, asked_by=self.context.stages.need_truth)
+        T_cam_obj = self.queries.true_pose(d, asked_by=self.context.stages.oracle)
         return Truth(T_cam_obj, self.context.model(d.obj_id).symmetries)
 
     def _estimate(

@@ -17,8 +17,9 @@ from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
 from pipeline.io.digests import file_digest
+from pipeline.items.features import CropFeatures
+from pipeline.items.online import Query
 from pipeline.items.views import Crop, Crops, Detection, Geometry
-from pipeline.route import Query
 from pipeline.spec import digest
 from pipeline.stages.render.raycast import render_depth
 from pipeline.store import Ref, make_ref
@@ -191,7 +192,8 @@ class QueryNodes:
             "crop": crops.time_s / crops.rows,
             "extract": max(entry.time_s for entry in entries.values()) / crops.rows,
         }
-        return Query(maps, self.context.tensor(mask), A_crop_img, self.context.K(image)), share
+        crop = CropFeatures(maps, self.context.tensor(mask))
+        return Query(crop, A_crop_img, self.context.K(image)), share
 
     def crop_failure(self, index: int, d: Detection) -> str:
         """Why a detection has no crop."""

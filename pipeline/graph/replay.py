@@ -10,10 +10,11 @@ from jaxtyping import UInt8
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.items.online import Hypothesis
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
-from pipeline.route import Hypothesis, retrace_pose
+from pipeline.route import replay_hypothesis
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +49,8 @@ class Retracer:
             return Retraced(detection, query_rgb)
         score = answer.template_score if isinstance(answer, PoseEstimate) else 0.0
         bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
-        hypothesis = retrace_pose(context.stages, query, bank, answer.template_id, score)
-        if hypothesis.drawn is not None:
-            return Retraced(detection, query_rgb, hypothesis.drawn.rgb, hypothesis)
+        hypothesis = replay_hypothesis(context.stages, query, bank, answer.template_id, score)
+        if hypothesis.rerendered is not None:
+            return Retraced(detection, query_rgb, hypothesis.rerendered.rgb, hypothesis)
         crops = context.store.read(self.templates.crops(answer.obj_id))
         return Retraced(detection, query_rgb, crops.array("rgb", [answer.template_id])[0], hypothesis)

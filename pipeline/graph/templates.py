@@ -12,16 +12,18 @@ import torch
 from jaxtyping import Float
 
 from pipeline.errors import DzopError
-from pipeline.fits import Fit, Fitted, chain, foreground_cells
+from pipeline.fits import chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
 from pipeline.functional.resample import resample
 from pipeline.functional.rigid import rigid
+from pipeline.functional.similarity import map_norms
 from pipeline.graph.context import Context, stack_crops
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
-from pipeline.items.features import TemplateCells
+from pipeline.items.features import CropFeatures, FittedArrays, TemplateCells
+from pipeline.items.fit import Fit
+from pipeline.items.online import TemplateView
 from pipeline.items.views import Crops, Geometry, Templates
-from pipeline.route import TemplateView
 from pipeline.stages.crop import HALF
 from pipeline.store import Layout, Ref, make_ref
 
@@ -42,12 +44,17 @@ class StoredBank:
     view: Callable[[int], TemplateView]
     draw: Callable[[Pose, Matrix, Matrix], TemplateView]
     poses: Callable[[], np.ndarray]
-    fitted: Callable[[Fit], Fitted]
+    fitted: Callable[[Fit], FittedArrays]
 
     @cached_property
     def features(self) -> torch.Tensor:
         """Features of the match layer, float16; read when a matcher asks, for they are most of what an object takes."""
         return self.maps()
+
+    @cached_property
+    def norms(self) -> torch.Tensor:
+        """Lengths of the flattened maps, float32; computed when a matcher first asks."""
+        return map_norms(self.features)
 
     @cached_property
     def mask(self) -> torch.Tensor:
@@ -191,7 +198,7 @@ class TemplateNodes:
         layouts = {name: Layout(array.shape, array.dtype.name) for name, array in arrays.items()}
         self.context.fill("fits", "", {ref: layouts}, 1, 1, compute)
 
-    def read_fitted(self, obj_id: int, fit: Fit, *, device: str) -> Fitted:
+    def read_fitted(self, obj_id: int, fit: Fit, *, device: str) -> FittedArrays:
         """Arrays of a fit and of all it stands on."""
         arrays: dict[str, torch.Tensor] = {}
         for part in chain(fit):
@@ -250,10 +257,10 @@ class TemplateNodes:
         @lru_cache(maxsize=self.views)
         def view(index: int) -> TemplateView:
             return TemplateView(
-                features={
-                    layer: self.context.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()
-                },
-                mask=self.context.tensor(crops.array("mask", [index])[0]),
+                crop=CropFeatures(
+                    {layer: self.context.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()},
+                    self.context.tensor(crops.array("mask", [index])[0]),
+                ),
                 A_crop_img=crops.array("A_crop_img", [index])[0],
                 depth_mm=templates.array("depth_mm", [index])[0],
                 K=K,
@@ -261,7 +268,7 @@ class TemplateNodes:
             )
 
         @lru_cache(maxsize=4)
-        def fitted(fit: Fit) -> Fitted:
+        def fitted(fit: Fit) -> FittedArrays:
             return self.read_fitted(obj_id, fit, device=self.context.device)
 
         return StoredBank(
@@ -290,5 +297,5 @@ class TemplateNodes:
             layer: self.context.tensor(maps[0]) for layer, maps in self.context.maps(crops, stages.layers).items()
         }
         return TemplateView(
-            features, self.context.tensor(mask), A_crop_drawn, depth_mm[0], K_drawn, T_drawn_obj, rgb=crop
+            CropFeatures(features, self.context.tensor(mask)), A_crop_drawn, depth_mm[0], K_drawn, T_drawn_obj, rgb=crop
         )

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from pipeline.io.files import write_json
-from pipeline.route import ONLINE_STAGES, Stages
+from pipeline.method import ONLINE_STAGES, Stages
 from pipeline.spec import digest
 
 FOLDER = ".rates"

@@ -1,10 +1,10 @@
-"""Matches: which template, and which of its points lie where in the query."""
+"""Matches of templates, and of points of a template with points of the query."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -15,6 +15,15 @@ class TemplateMatch:
     index: Int[Tensor, " k"]
     score: Float[Tensor, " k"]
     margin: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrueMatches:
+    """Where template points truly appear in the query, both in crop pixels; input of correspond=oracle."""
+
+    template_px: Float[Tensor, "m 2"]
+    query_px: Float[Tensor, "m 2"]
+    query_mask: Bool[Tensor, "S S"]
 
 
 @dataclass(frozen=True, eq=False)

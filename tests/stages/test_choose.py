@@ -6,7 +6,7 @@ import torch
 
 from pipeline.errors import BadInput
 from pipeline.functional.agreement import agreement
-from pipeline.items.features import FusedPair
+from pipeline.items.features import FusedPair, PairGeometry
 from pipeline.spec import build
 from pipeline.stages.choose.agreement import Agreement
 from pipeline.stages.choose.inliers import Inliers
@@ -41,7 +41,8 @@ def pose(shift_cells: float = 0.0) -> np.ndarray:
 
 
 def judged(spec, T: np.ndarray, inliers: int = 20, query_mask: torch.Tensor | None = None) -> float:
-    return spec(T, inliers, pair_of(square() if query_mask is None else query_mask), points(), K_CROP, crop_size=SIZE)
+    pair = pair_of(square() if query_mask is None else query_mask)
+    return spec(T, inliers, PairGeometry(pair, points(), K_CROP, SIZE))
 
 
 def values(T: np.ndarray, query_mask: torch.Tensor) -> tuple[float, float]:
@@ -86,9 +87,8 @@ def test_a_pose_that_shows_nothing_is_worth_nothing(T):
 def test_points_off_the_object_are_left_out():
     some = points()
     some[::3] = np.nan
-    assert Agreement(inlier_power=0)(pose(), 9, pair_of(square()), some, K_CROP, crop_size=SIZE) == pytest.approx(
-        1, abs=0.05
-    )
+    geometry = PairGeometry(pair_of(square()), some, K_CROP, SIZE)
+    assert Agreement(inlier_power=0)(pose(), 9, geometry) == pytest.approx(1, abs=0.05)
 
 
 def test_agreement_prefers_the_right_pose_to_more_inliers_and_inliers_do_not():

@@ -5,8 +5,8 @@ from sklearn.decomposition import PCA
 from sklearn.feature_extraction.text import TfidfTransformer
 
 from pipeline.errors import DzopError
-from pipeline.fits import chain, fitted_to, foreground_cells
-from pipeline.fits.projection import Projection, on_axes
+from pipeline.fits import chain, fit_arrays, foreground_cells
+from pipeline.fits.projection import Projection, project_map
 from pipeline.functional.masks import cell_mask
 from pipeline.items.features import TemplateCells
 from pipeline.spec import digest
@@ -39,7 +39,7 @@ def test_a_projection_is_scikit_learns_pca_of_all_foreground_cells():
     cells = foreground_cells(bank, mask)
     arrays = Projection(layer=11, dim=5)(cells, {})
     reference = PCA(n_components=5, svd_solver="full").fit(cells.features.double().numpy())
-    found = on_axes(bank[2], arrays).flatten(1).T.numpy()
+    found = project_map(bank[2], arrays).flatten(1).T.numpy()
     expected = reference.transform(bank[2].flatten(1).T.double().numpy())
     assert np.allclose(found, np.sign((found * expected).sum(0)) * expected, atol=1e-4)  # float32 of values about 3
 
@@ -54,7 +54,7 @@ def test_words_are_of_projected_cells_and_template_vectors_scikit_learns_tfidf()
     match = Words(dim=6, count=20, assignments=1)
     bank, mask = _bank()
     cells = foreground_cells(bank, mask)
-    arrays = fitted_to(match.fit, cells)
+    arrays = fit_arrays(match.fit, cells)
     assert set(arrays) == {"mean", "axes", "words", "idf", "templates"}
     assert arrays["words"].shape == (20, 6)
     points = (cells.features.float() - arrays["mean"]) @ arrays["axes"]
@@ -69,9 +69,9 @@ def test_words_are_of_projected_cells_and_template_vectors_scikit_learns_tfidf()
 def test_fits_are_the_same_bytes_every_time_and_shared_where_their_recipes_are():
     bank, mask = _bank()
     fit = Words(dim=6, count=20, samples=100).fit
-    first, again = (fitted_to(fit, foreground_cells(bank.clone(), mask)) for _ in range(2))
+    first, again = (fit_arrays(fit, foreground_cells(bank.clone(), mask)) for _ in range(2))
     assert all(torch.equal(first[name], again[name]) for name in first)
-    other = fitted_to(Words(dim=6, count=20, samples=100, seed=1).fit, foreground_cells(bank, mask))
+    other = fit_arrays(Words(dim=6, count=20, samples=100, seed=1).fit, foreground_cells(bank, mask))
     assert not torch.equal(first["words"], other["words"])
     assert chain(fit) == (TemplatePca(layers=(11,), dim=6).fit, fit)
     assert Words(top_k=1).fit == Words(top_k=9).fit  # a sweep over what is kept fits nothing again
@@ -80,7 +80,7 @@ def test_fits_are_the_same_bytes_every_time_and_shared_where_their_recipes_are()
 def test_fits_are_those_of_their_version():
     """When this fails on purpose, raise the fit's own version, beside that of the stage: stored fits are kept by it."""
     fit = Words(dim=6, count=20, weights="gaussian").fit
-    arrays = fitted_to(fit, foreground_cells(*_bank()))
+    arrays = fit_arrays(fit, foreground_cells(*_bank()))
     assert (fit.version, fit.projection.version) == (1, 1)
     assert digest(fit.recipe()) == "f5e6bb37a1953ede9dc1ef4cebaf742da33651dac773e78f721fd014997c2314"
     found = [float(arrays[name].abs().double().sum()) for name in ("mean", "axes", "words", "idf", "templates")]

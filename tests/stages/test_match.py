@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 import torch
+from array_bank import match as match_maps
+from array_bank import match_truth
 
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.masks import cell_mask
@@ -25,7 +27,7 @@ def _bank(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("match", [*PER_CELL, *WORDS], ids=repr)
 def test_template_finds_itself(match):
     bank, mask = _bank()
-    found = match(bank[5].float(), mask[5], bank, mask)
+    found = match_maps(match, bank[5].float(), mask[5], bank, mask)
     assert found.index.tolist()[0] == 5
     assert found.index.shape == found.score.shape == (3,)
     assert (found.score.diff() <= 0).all()
@@ -36,7 +38,7 @@ def test_template_finds_itself(match):
 @pytest.mark.parametrize("match", PER_CELL, ids=repr)
 def test_the_scale_of_the_querys_features_plays_no_part(match):
     bank, mask = _bank()
-    first, second = (match(factor * bank[5].float(), mask[5], bank, mask) for factor in (1, 4))
+    first, second = (match_maps(match, factor * bank[5].float(), mask[5], bank, mask) for factor in (1, 4))
     assert torch.equal(first.index, second.index)
     assert torch.allclose(first.score, second.score, atol=1e-6)
 
@@ -46,7 +48,7 @@ def test_what_lies_outside_the_masks_changes_nothing(match):
     bank, mask = _bank()
     query, background = bank[5].float(), torch.ones(10, 8, 8)
     other = torch.where(cell_mask(mask[5], cells=8), query, background)
-    first, second = (match(q, mask[5], bank, mask) for q in (query, other))
+    first, second = (match_maps(match, q, mask[5], bank, mask) for q in (query, other))
     assert torch.equal(first.index, second.index)
     assert torch.equal(first.score, second.score)
 
@@ -56,7 +58,7 @@ def test_masked_cosine_equals_a_loop_over_cells(normalise):
     bank, mask = _bank(4)
     mask = mask[:, ::4, ::4].repeat_interleave(4, 1).repeat_interleave(4, 2)  # whole cells
     query, cells = bank[0].double() + bank[1].double(), mask[:, ::4, ::4]
-    found = MaskedCosine(top_k=4, normalise=normalise)(query, mask[0], bank, mask)
+    found = match_maps(MaskedCosine(top_k=4, normalise=normalise), query, mask[0], bank, mask)
     for index, score in zip(found.index.tolist(), found.score.tolist(), strict=True):
         total = 0.0
         for i, j in (cells[0] & cells[index]).nonzero().tolist():
@@ -73,10 +75,10 @@ def test_masked_cosine_equals_a_loop_over_cells(normalise):
 def test_of_equal_templates_the_first_wins_and_the_margin_is_to_the_first_left_out():
     bank, mask = _bank(3)
     bank, mask = bank.repeat(3, 1, 1, 1), mask.repeat(3, 1, 1)
-    found = Cosine(top_k=3)(bank[1].float(), mask[1], bank, mask)
+    found = match_maps(Cosine(top_k=3), bank[1].float(), mask[1], bank, mask)
     assert found.index.tolist() == [1, 4, 7]
-    assert Cosine(top_k=2)(bank[1].float(), mask[1], bank, mask).margin == 0
-    assert Cosine(top_k=50)(bank[1].float(), mask[1], bank, mask).index.shape == (9,)
+    assert match_maps(Cosine(top_k=2), bank[1].float(), mask[1], bank, mask).margin == 0
+    assert match_maps(Cosine(top_k=50), bank[1].float(), mask[1], bank, mask).index.shape == (9,)
 
 
 def test_words_that_are_hidden_in_part_and_moved_about_still_find_their_template():
@@ -88,28 +90,28 @@ def test_words_that_are_hidden_in_part_and_moved_about_still_find_their_template
     hidden = everywhere[5].clone()
     hidden[:, 20:] = False
     for match in WORDS:
-        assert match(shuffled.float(), hidden, bank, everywhere).index.tolist()[0] == 5
+        assert match_maps(match, shuffled.float(), hidden, bank, everywhere).index.tolist()[0] == 5
 
 
 def test_fewer_words_than_asked_for_are_those_there_are():
     bank, mask = _bank(2)
-    assert Words(dim=300, assignments=9)(bank[1].float(), mask[1], bank, mask).index.tolist()[0] == 1
+    assert match_maps(Words(dim=300, assignments=9), bank[1].float(), mask[1], bank, mask).index.tolist()[0] == 1
 
 
 @pytest.mark.parametrize("match", PER_CELL, ids=repr)
 def test_features_without_content_say_why(match):
     bank, mask = _bank()
     with pytest.raises(NoPose, match="match: query and templates share no feature"):
-        match(torch.zeros(10, 8, 8), mask[0], bank, mask)
+        match_maps(match, torch.zeros(10, 8, 8), mask[0], bank, mask)
     with pytest.raises(NoPose, match="match: features are not finite"):
-        match(torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
+        match_maps(match, torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
 
 
 @pytest.mark.parametrize("match", [MaskedCosine(), *WORDS], ids=repr)
 def test_empty_query_mask_says_why(match):
     bank, mask = _bank()
     with pytest.raises(NoPose, match="match: query mask is empty, needs 1 pixel"):
-        match(bank[0].float(), torch.zeros(32, 32, dtype=torch.bool), bank, mask)
+        match_maps(match, bank[0].float(), torch.zeros(32, 32, dtype=torch.bool), bank, mask)
 
 
 def test_the_oracle_takes_the_nearest_view_off_the_axis_and_up_to_symmetries():
@@ -117,23 +119,23 @@ def test_the_oracle_takes_the_nearest_view_off_the_axis_and_up_to_symmetries():
     # the object of view 1, moved to the side of the image and turned with the viewing ray, looks the same
     ray = rotation_between(np.array([0.0, 0, 1]), np.array([0.3, -0.2, 1.0]))
     moved = rigid(ray @ T_cam_obj[1, :3, :3], ray @ T_cam_obj[1, :3, 3])
-    found = Oracle(top_k=2).by_truth(moved, np.eye(4)[None], T_cam_obj)
+    found = match_truth(Oracle(top_k=2), moved, np.eye(4)[None], T_cam_obj)
     assert found.index.tolist()[0] == 1
     assert float(found.score[0]) == pytest.approx(1, abs=1e-6)
     half_turn = rigid(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    both = Oracle(top_k=2).by_truth(moved, np.stack([np.eye(4), half_turn]), T_cam_obj)
+    both = match_truth(Oracle(top_k=2), moved, np.stack([np.eye(4), half_turn]), T_cam_obj)
     assert set(both.index.tolist()) == {1, 2}
 
 
 def test_the_oracle_cannot_work_without_the_truth():
     bank, mask = _bank()
     with pytest.raises(BadInput, match="match=oracle: found features, needs the true pose"):
-        Oracle()(bank[0].float(), mask[0], bank, mask)
+        match_maps(Oracle(), bank[0].float(), mask[0], bank, mask)
 
 
 def test_words_of_features_that_are_not_finite_or_tell_nothing_apart_say_why():
     bank, mask = _bank()
     with pytest.raises(NoPose, match="match: features are not finite"):
-        WORDS[0](torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
+        match_maps(WORDS[0], torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
     with pytest.raises(NoPose, match="match: query and templates share no feature"):
-        WORDS[0](bank[0].float(), mask[0], bank[:1], mask[:1])  # every word is in the only template
+        match_maps(WORDS[0], bank[0].float(), mask[0], bank[:1], mask[:1])  # every word is in the only template

@@ -15,7 +15,7 @@ import torch
 from pipeline.errors import BadInput
 from pipeline.functional import camera, featuremetric, rigid
 from pipeline.functional.masks import foreground
-from pipeline.items.features import FusedPair
+from pipeline.items.features import CropFeatures, FusedPair, PairGeometry
 from pipeline.items.views import Crops, Geometry
 from pipeline.spec import Runtime, build
 from pipeline.stages.crop.square import Square
@@ -43,7 +43,7 @@ class Case:
     T_cam_obj: np.ndarray
 
     def __call__(self, refine, start: np.ndarray) -> np.ndarray:
-        return refine(start, self.pair, self.points_obj, self.K_crop, crop_size=CROP.size)
+        return refine(start, PairGeometry(self.pair, self.points_obj, self.K_crop, CROP.size))
 
 
 def view(mesh, K, T_cam_obj, size_hw, rng, hidden):
@@ -52,10 +52,12 @@ def view(mesh, K, T_cam_obj, size_hw, rng, hidden):
     mask, (y, x), angle = depth_mm > 0, np.mgrid[: size_hw[0], : size_hw[1]], rng.uniform(0, 2 * np.pi)
     along = np.cos(angle) * x + np.sin(angle) * y
     mask &= along <= np.quantile(along[mask], 1 - hidden)
-    crop, mask, A_crop_img = CROP(np.zeros((*size_hw, 3), np.uint8), mask, camera.mask_bbox(mask), K)
-    crops = Crops(crop[None], mask[None], A_crop_img[None], Geometry([depth_mm], K[None], T_cam_obj[None]))
+    crop = CROP(np.zeros((*size_hw, 3), np.uint8), mask, camera.mask_bbox(mask), K)
+    crops = Crops(
+        crop.rgb[None], crop.mask[None], crop.A_crop_img[None], Geometry([depth_mm], K[None], T_cam_obj[None])
+    )
     maps = Coordinates().load(Runtime(device="cpu"))(crops, [11])
-    return {11: maps[11][0]}, torch.from_numpy(mask), A_crop_img, depth_mm
+    return {11: maps[11][0]}, torch.from_numpy(crop.mask), crop.A_crop_img, depth_mm
 
 
 @lru_cache(maxsize=2)
@@ -71,7 +73,7 @@ def case(seed: int, hidden: float = 0.0, own_template: bool = False) -> Case:
         place = np.array([rng.uniform(-80, 80), rng.uniform(-60, 60), rng.uniform(500, 900)])
         K_query, T_query = K_QUERY, rigid.rigid(off(T_template, rng, 15, 0)[:3, :3], place)
         query = view(mesh, K_query, T_query, (960, 1280), rng, hidden)
-    pair = Concat(layers=(11,))(query[0], template[0], query[1], template[1])
+    pair = Concat(layers=(11,))(CropFeatures(*query[:2]), CropFeatures(*template[:2]))
     cells = pair.template_mask.shape[-1]
     xy = camera.grid_xy(foreground(pair.template_mask), width=cells).double()
     px = camera.cell_to_px(xy, size=CROP.size, cells=cells).numpy()
@@ -138,9 +140,8 @@ def test_where_nothing_can_be_compared_the_pose_comes_back(refine):
 def test_another_scale_of_the_crop_changes_nothing(refine):
     scene = case(3)
     start = off(scene.T_cam_obj, np.random.default_rng(0), 10, 10)
-    larger = refine(
-        start, scene.pair, scene.points_obj, camera.resize_affine(3.0) @ scene.K_crop, crop_size=3 * CROP.size
-    )
+    K_crop = camera.resize_affine(3.0) @ scene.K_crop
+    larger = refine(start, PairGeometry(scene.pair, scene.points_obj, K_crop, 3 * CROP.size))
     np.testing.assert_allclose(larger, scene(refine, start), atol=1e-5)  # mm; rounding, grown by the steps
 
 

@@ -1,32 +1,19 @@
-"""a solved hypothesis -> its worth; of a detection's hypotheses the worthiest is refined and answers."""
+"""hypothesis -> its score; the highest-scoring hypothesis of a detection is refined and becomes its pose."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.items.features import FusedPair
-from pipeline.spec import Variant
+from pipeline.items.features import PairGeometry
+from pipeline.spec import Spec
 
 
-class Chooser(Variant, Protocol):
-    """What a choose variant is.
+class HypothesisScorer(Spec, ABC):
+    """Contract of a choose variant. It never sees ground truth."""
 
-    ``points_obj`` and ``K_crop`` are those of stages.refine: object points (mm) at the centres of the template's
-    foreground cells, NaN off the object, and camera frame to crop pixels, ``crop_size`` of them a side.
-    """
-
-    def __call__(
-        self,
-        T_cam_obj: Float[np.ndarray, "4 4"],
-        inliers: int,
-        pair: FusedPair,
-        points_obj: Float[np.ndarray, "m 3"],
-        K_crop: Float[np.ndarray, "3 3"],
-        *,
-        crop_size: int,
-    ) -> float:
-        """Worth of a pose, at least 0. Nothing here sees ground truth. Never raises NoPose."""
-        ...
+    @abstractmethod
+    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
+        """Score of a pose (mm), at least 0; higher is better. Never raises NoPose."""

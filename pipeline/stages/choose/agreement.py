@@ -1,4 +1,4 @@
-"""hypothesis -> how much the query looks like the template where the pose puts it, and how much of it that explains."""
+"""hypothesis -> how well the template, moved to its pose, explains what the query shows."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from jaxtyping import Float
 
 from pipeline.functional.agreement import agreement
 from pipeline.functional.camera import cell_affine
-from pipeline.items.features import FusedPair
-from pipeline.spec import NonNegativeFloat, Spec, spec
+from pipeline.items.features import PairGeometry
+from pipeline.spec import NonNegativeFloat, spec
+from pipeline.stages.choose import HypothesisScorer
 
 
 @spec
-class Agreement(Spec):
+class Agreement(HypothesisScorer):
     """Mean cosine times coverage times inliers to the power of ``inlier_power``.
 
-    The template's cells are put where the pose has them: the mean cosine is that of their descriptors with the query's
-    there, coverage the share of the query's foreground they reach (functional.agreement). Many inliers of a wrong
-    template may agree on a pose that explains a part of the object; few cosines do.
+    The template's cells are projected into the query under the pose: the mean cosine compares their descriptors with
+    the query's at those places, coverage is the share of the query's foreground that they reach
+    (functional.agreement). A wrong template can have many inliers for a pose that explains only a part of the object;
+    its cosine and coverage are low.
     """
 
     kind: ClassVar[str] = "choose.agreement"
@@ -27,19 +29,11 @@ class Agreement(Spec):
 
     inlier_power: NonNegativeFloat = 0.5
 
-    def __call__(
-        self,
-        T_cam_obj: Float[np.ndarray, "4 4"],
-        inliers: int,
-        pair: FusedPair,
-        points_obj: Float[np.ndarray, "m 3"],
-        K_crop: Float[np.ndarray, "3 3"],
-        *,
-        crop_size: int,
-    ) -> float:
+    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
         """The product; 0 where the template lands outside the query's foreground."""
-        K_cell = cell_affine(size=crop_size, cells=pair.query_mask.shape[-1]) @ K_crop
+        pair = geometry.pair
+        K_cell = cell_affine(size=geometry.crop_size, cells=pair.query_mask.shape[-1]) @ geometry.K_crop
         cosine, coverage = agreement(
-            pair.query, pair.template, pair.query_mask, pair.template_mask, points_obj, K_cell, T_cam_obj
+            pair.query, pair.template, pair.query_mask, pair.template_mask, geometry.points_obj, K_cell, T_cam_obj
         )
         return max(cosine, 0.0) * coverage * inliers**self.inlier_power

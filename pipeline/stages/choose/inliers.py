@@ -1,4 +1,4 @@
-"""hypothesis -> how many correspondences agree on its pose."""
+"""hypothesis -> the number of correspondences that agree with its pose."""
 
 from __future__ import annotations
 
@@ -7,26 +7,18 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.items.features import FusedPair
-from pipeline.spec import Spec, spec
+from pipeline.items.features import PairGeometry
+from pipeline.spec import spec
+from pipeline.stages.choose import HypothesisScorer
 
 
 @spec
-class Inliers(Spec):
-    """Most inliers win (FoundPose, Örnek et al., ECCV 2024)."""
+class Inliers(HypothesisScorer):
+    """The hypothesis with most inliers wins (FoundPose, Örnek et al., ECCV 2024)."""
 
     kind: ClassVar[str] = "choose.inliers"
     version: ClassVar[int] = 1
 
-    def __call__(
-        self,
-        T_cam_obj: Float[np.ndarray, "4 4"],
-        inliers: int,
-        pair: FusedPair,
-        points_obj: Float[np.ndarray, "m 3"],
-        K_crop: Float[np.ndarray, "3 3"],
-        *,
-        crop_size: int,
-    ) -> float:
+    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
         """The number of inliers."""
         return float(inliers)

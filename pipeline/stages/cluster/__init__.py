@@ -1,41 +1,37 @@
-"""fused pair -> clusters of both sides and which of them correspond."""
+"""fused pair -> clusters of query and template, and which of them correspond."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from abc import ABC, abstractmethod
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.items.features import Clusters, FusedPair
-from pipeline.spec import Variant
+from pipeline.errors import NoPose
+from pipeline.items.features import ClusteredMap, Clusters, FusedPair
+from pipeline.spec import Spec
 
 
-@dataclass(frozen=True, eq=False)
-class Side:
-    """One side's clusters: the label of each foreground cell (-1: background), and the centre of each cluster."""
+class Clusterer(Spec, ABC):
+    """Contract of a cluster variant: ``encode`` clusters one map, ``pair`` matches the clusters of two."""
 
-    label: Int[Tensor, "h w"]
-    centre: Float[Tensor, "k d"]
+    @abstractmethod
+    def encode(self, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> ClusteredMap:
+        """Clusters of the foreground cells, of which there is at least one."""
 
-
-class Clusterer(Variant, Protocol):
-    """What a cluster variant is."""
+    @abstractmethod
+    def pair(self, query: ClusteredMap, template: ClusteredMap) -> Clusters:
+        """Which clusters correspond. Raises NoPose when no pair is left."""
 
     def __call__(self, pair: FusedPair) -> Clusters:
-        """Labels and matched pairs. Raises NoPose when no pair is left."""
-        ...
+        """Cluster both maps and match. Raises NoPose for a mask without a cell and when no pair is left."""
+        require_cells(pair)
+        query = self.encode(pair.query, pair.query_mask)
+        return self.pair(query, self.encode(pair.template, pair.template_mask))
 
 
-@runtime_checkable
-class SidedClusterer(Protocol):
-    """One whose clusters of a side depend on that side alone: those of a map met before are found once."""
-
-    def side(self, name: str, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> Side:
-        """Clusters of the side called ``name``. Raises NoPose for a mask without a cell."""
-        ...
-
-    def paired(self, query: Side, template: Side) -> Clusters:
-        """Which clusters correspond. Raises NoPose when no pair is left."""
-        ...
+def require_cells(pair: FusedPair) -> None:
+    """Raise NoPose for a mask without a cell."""
+    for name, mask in (("query", pair.query_mask), ("template", pair.template_mask)):
+        if not mask.any():
+            raise NoPose("cluster", f"{name} mask has no cell")

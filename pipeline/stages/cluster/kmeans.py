@@ -1,4 +1,4 @@
-"""fused pair -> k-means clusters of both sides, paired by the cosine of their centres."""
+"""fused pair -> k-means clusters of query and template, matched by the cosine of their centres."""
 
 from __future__ import annotations
 
@@ -9,25 +9,24 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.errors import NoPose
 from pipeline.functional.camera import grid_xy
 from pipeline.functional.epipolar import epipolar_inliers
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import foreground
 from pipeline.functional.similarity import l2_normalize, mutual_nearest
-from pipeline.items.features import Clusters, FusedPair
-from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
-from pipeline.stages.cluster import Side
+from pipeline.items.features import ClusteredMap, Clusters
+from pipeline.spec import NonNegative, Positive, PositiveFloat, spec
+from pipeline.stages.cluster import Clusterer
 
 
 @spec
-class KMeans(Spec):
-    """Clusters that may correspond (von Gimborn et al., "Cluster-wise correspondence estimation").
+class KMeans(Clusterer):
+    """Matched clusters (von Gimborn et al., "Cluster-wise correspondence estimation").
 
-    Each side's foreground cells, scaled to unit length so that distance is cosine, fall into ``count`` clusters;
-    clusters whose centres are each other's most similar form a pair. ``epipolar`` drops the pairs whose mean positions
-    (in cells) lie more than ``threshold_cells`` off the epipolar lines of one fundamental matrix; it is skipped, and
-    ``note`` says why, where that matrix is not defined: fewer than 8 pairs, or a near-planar set.
+    The foreground cells of each image, scaled to unit length so that distance means cosine, are grouped into ``count``
+    clusters; clusters whose centres are mutual nearest neighbours form a pair. ``epipolar`` drops pairs whose mean
+    positions (in cells) lie more than ``threshold_cells`` off the epipolar lines of one fundamental matrix. The check
+    is skipped, and ``note`` says why, where that matrix is undefined: fewer than 8 pairs, or a near-planar set.
     """
 
     kind: ClassVar[str] = "cluster.kmeans"
@@ -40,38 +39,31 @@ class KMeans(Spec):
     threshold_cells: PositiveFloat = 2.0
     epipolar_iterations: Positive = 1000
 
-    def __call__(self, pair: FusedPair) -> Clusters:
-        """Labels, pairs, and what was clamped or skipped. Raises NoPose for a mask without a cell."""
-        query = self.side("query", pair.query, pair.query_mask)
-        return self.paired(query, self.side("template", pair.template, pair.template_mask))
-
-    def side(self, name: str, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> Side:
-        """Clusters of one side. Raises NoPose, with the side's name, for a mask without a cell."""
+    def encode(self, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> ClusteredMap:
+        """k-means clusters of the foreground cells, fewer than ``count`` where there are fewer distinct cells."""
         cells = foreground(mask)
-        if len(cells) == 0:
-            raise NoPose("cluster", f"{name} mask has no cell")
         points = l2_normalize(features.float().flatten(1).T[cells])
         of_cell, centre = kmeans(points, count=self.count, seed=self.seed, iterations=self.iterations)
         label = torch.full_like(mask, -1, dtype=torch.int64)
         label.view(-1)[cells] = of_cell
-        return Side(label, centre)
+        return ClusteredMap(label, centre)
 
-    def paired(self, query: Side, template: Side) -> Clusters:
-        """The sides' labels, the clusters that correspond, and what was clamped or skipped."""
+    def pair(self, query: ClusteredMap, template: ClusteredMap) -> Clusters:
+        """Labels of both, the clusters that correspond, and what was clamped or skipped."""
         pairs = mutual_nearest(l2_normalize(query.centre) @ l2_normalize(template.centre).T)
         notes = [
-            f"{name}: {len(side.centre)} of {self.count} clusters"
-            for name, side in (("query", query), ("template", template))
-            if len(side.centre) < self.count
+            f"{name}: {len(clustered.centre)} of {self.count} clusters"
+            for name, clustered in (("query", query), ("template", template))
+            if len(clustered.centre) < self.count
         ]
         if self.epipolar:
             positions = [_mean_xy(query.label)[pairs[:, 0].cpu()], _mean_xy(template.label)[pairs[:, 1].cpu()]]
-            keep, skipped = self._consistent(*(p.numpy() for p in positions))
+            keep, skipped = self._check_epipolar(*(p.numpy() for p in positions))
             pairs = pairs if keep is None else pairs[torch.from_numpy(keep).to(pairs.device)]
             notes += [f"epipolar check skipped: {skipped}"] if skipped else []
         return Clusters(query.label, template.label, pairs, note="; ".join(notes))
 
-    def _consistent(
+    def _check_epipolar(
         self, query_xy: Float[np.ndarray, "p 2"], template_xy: Float[np.ndarray, "p 2"]
     ) -> tuple[Bool[np.ndarray, " p"] | None, str]:
         return epipolar_inliers(

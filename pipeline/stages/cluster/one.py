@@ -1,27 +1,30 @@
-"""fused pair -> one cluster that is the whole foreground."""
+"""fused pair -> one cluster that holds the whole foreground."""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from pipeline.errors import NoPose
-from pipeline.items.features import Clusters, FusedPair
-from pipeline.spec import Spec, spec
+from pipeline.items.features import ClusteredMap, Clusters
+from pipeline.spec import spec
+from pipeline.stages.cluster import Clusterer
 
 
 @spec
-class One(Spec):
+class One(Clusterer):
     """Clustering off: any cell of the query may match any cell of the template."""
 
     kind: ClassVar[str] = "cluster.one"
     version: ClassVar[int] = 1
 
-    def __call__(self, pair: FusedPair) -> Clusters:
-        """Label 0 inside the masks. Raises NoPose for a mask without a cell."""
-        for name, mask in (("query", pair.query_mask), ("template", pair.template_mask)):
-            if not mask.any():
-                raise NoPose("cluster", f"{name} mask has no cell")
-        both = torch.zeros(1, 2, dtype=torch.int64, device=pair.query.device)
-        return Clusters(pair.query_mask.long() - 1, pair.template_mask.long() - 1, both)
+    def encode(self, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> ClusteredMap:
+        """Label 0 inside the mask; its centre is not used and has no dimensions."""
+        return ClusteredMap(mask.long() - 1, features.new_zeros(1, 0))
+
+    def pair(self, query: ClusteredMap, template: ClusteredMap) -> Clusters:
+        """The two clusters correspond."""
+        both = torch.zeros(1, 2, dtype=torch.int64, device=query.label.device)
+        return Clusters(query.label, template.label, both)

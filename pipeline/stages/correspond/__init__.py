@@ -2,52 +2,45 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.functional.camera import cell_to_px, grid_xy
 from pipeline.functional.masks import foreground
 from pipeline.items.features import Clusters, FusedPair
-from pipeline.items.matches import Correspondences
-from pipeline.spec import Variant
+from pipeline.items.matches import Correspondences, TrueMatches
+from pipeline.spec import Spec
 
 
-class Corresponder(Variant, Protocol):
-    """What a correspond variant is. ``crop_size``: side S of the crops in pixels."""
+class Corresponder(Spec, ABC):
+    """Contract of a correspond variant.
 
-    def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
-        """Matched points, best first within a cluster. Raises NoPose when there is none."""
-        ...
+    ``needs_truth``: True for oracles, which receive ``truth``. ``needs_saliency``: True where it reads the pair's
+    saliency; the extractor is then asked for SALIENCY_LAYER as well.
+    """
 
+    needs_truth: ClassVar[bool] = False
+    needs_saliency: ClassVar[bool] = False
 
-@runtime_checkable
-class TruthCorresponder(Protocol):
-    """An oracle that is told where points truly lie; no other corresponder is."""
-
-    needs_truth: ClassVar[bool]
-
-    def by_truth(
-        self, template_px: Float[Tensor, "m 2"], true_px: Float[Tensor, "m 2"], query_mask: Bool[Tensor, "S S"]
+    @abstractmethod
+    def __call__(
+        self, pair: FusedPair, clusters: Clusters, *, crop_size: int, truth: TrueMatches | None = None
     ) -> Correspondences:
-        """The pairs that both see."""
-        ...
+        """Matched points, best first within a cluster. Crops have ``crop_size`` pixels a side.
 
-
-@runtime_checkable
-class SalientCorresponder(Protocol):
-    """One that reads the pair's saliency: the extractor is asked for SALIENCY_LAYER too."""
-
-    needs_saliency: ClassVar[bool]
+        Raises NoPose when there is none.
+        """
 
 
 def cells_in_pairs(label: Int[Tensor, "h w"], paired: Int[Tensor, " p"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
     """Flat indices of the cells whose cluster is in a pair, and the index of that pair."""
     pair_of = torch.full((int(label.max()) + 2,), -1, dtype=torch.int64, device=label.device)
     pair_of[paired] = torch.arange(len(paired), device=label.device)
-    of_cell = pair_of[label.flatten()]  # background, -1, reads the last entry, which no cluster owns
+    of_cell = pair_of[label.flatten()]  # the background's -1 indexes the last entry, which no cluster has
     cells = foreground(of_cell >= 0)
     return cells, of_cell[cells]
 

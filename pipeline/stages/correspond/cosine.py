@@ -10,19 +10,19 @@ from pipeline.errors import NoPose
 from pipeline.functional.similarity import best_per_group, l2_normalize, nearest_with_same_label
 from pipeline.functional.subpixel import neighbourhood_shift
 from pipeline.items.features import Clusters, FusedPair
-from pipeline.items.matches import Correspondences
-from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.correspond import cell_px, cells_in_pairs
+from pipeline.items.matches import Correspondences, TrueMatches
+from pipeline.spec import Positive, spec
+from pipeline.stages.correspond import Corresponder, cell_px, cells_in_pairs
 
 
 @spec
-class Cosine(Spec):
+class Cosine(Corresponder):
     """Each query cell's most similar template cell inside the paired cluster, the ``per_cluster`` best of each pair.
 
     von Gimborn et al., "Semantic Correspondence Estimation" ("mutual semantic correspondences"; top 10).
-    ``per_cluster`` keeps large clusters from outvoting small ones; a single pair has nothing to balance and keeps all.
-    ``mutual``: only where the query cell is the template cell's most similar too. ``kernel``: side, in cells, of the
-    neighbourhood that places the template's point in between cells (functional.subpixel); 1 = off, the cell's centre.
+    ``per_cluster`` keeps large clusters from outvoting small ones; a single cluster pair keeps all of its matches.
+    ``mutual``: keep mutual nearest neighbours only. ``kernel``: side, in cells, of the neighbourhood that gives the
+    template's point its sub-pixel position (functional.subpixel); 1 = off, the cell's centre.
     """
 
     kind: ClassVar[str] = "correspond.cosine"
@@ -32,7 +32,9 @@ class Cosine(Spec):
     mutual: bool = True
     kernel: Literal[1, 3, 5, 7] = 3
 
-    def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
+    def __call__(
+        self, pair: FusedPair, clusters: Clusters, *, crop_size: int, truth: TrueMatches | None = None
+    ) -> Correspondences:
         """Matched points, by cluster pair, best first. Raises NoPose when there is none."""
         query_cell, query_pair = cells_in_pairs(clusters.query_label, clusters.pairs[:, 0])
         template_cell, template_pair = cells_in_pairs(clusters.template_label, clusters.pairs[:, 1])

@@ -1,4 +1,4 @@
-"""fused pair, clusters -> corresponding points, in crop pixels: cells that lead back near to where one started."""
+"""fused pair, clusters -> corresponding points, in crop pixels: cells whose match leads back near the start."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from pipeline.errors import NoPose
 from pipeline.functional.camera import grid_xy
 from pipeline.functional.similarity import l2_normalize, nearest_with_same_label
 from pipeline.items.features import Clusters, FusedPair
-from pipeline.items.matches import Correspondences
-from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.correspond import cell_px, cells_in_pairs
+from pipeline.items.matches import Correspondences, TrueMatches
+from pipeline.spec import Positive, spec
+from pipeline.stages.correspond import Corresponder, cell_px, cells_in_pairs
 
 
 @spec
-class Cyclic(Spec):
+class Cyclic(Corresponder):
     """Cyclic buddies (Goodwin et al., "Zero-Shot Category-Level Object Pose Estimation", ECCV 2022, section 3.2).
 
-    Each query cell's nearest template cell, and that cell's nearest query cell: the ``count`` query cells that lie
-    nearest to where this cycle ends are kept, 0 cells off for those that are each other's nearest, of equals the more
-    similar. All inside the paired cluster; cluster=one as in FoundPose (Örnek et al., ECCV 2024, section 3.4).
-    ``metric``: what "nearest" means, the Euclidean distance of features (FoundPose's code) or their cosine. Points are
-    the cells' centres.
+    From each query cell to its nearest template cell, and from there to the nearest query cell: the ``count`` query
+    cells with the smallest distance to the end of this cycle are kept (0 for mutual nearest neighbours), ties by
+    similarity. Search stays inside the paired cluster; FoundPose uses cluster=one (Örnek et al., ECCV 2024, section
+    3.4). ``metric``: Euclidean distance of features (FoundPose's code) or cosine. Points are the cells' centres.
     """
 
     kind: ClassVar[str] = "correspond.cyclic"
@@ -34,26 +33,29 @@ class Cyclic(Spec):
     count: Positive = 300
     metric: Literal["euclidean", "cosine"] = "euclidean"
 
-    def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
+    def __call__(
+        self, pair: FusedPair, clusters: Clusters, *, crop_size: int, truth: TrueMatches | None = None
+    ) -> Correspondences:
         """Matched points, by cluster pair, smallest cyclic distance first. Raises NoPose when there is none."""
         query_cell, query_pair = cells_in_pairs(clusters.query_label, clusters.pairs[:, 0])
         template_cell, template_pair = cells_in_pairs(clusters.template_label, clusters.pairs[:, 1])
         if len(query_cell) == 0 or len(template_cell) == 0:
             raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
         query, template = (
-            side.float().flatten(1).T[cell] for side, cell in ((pair.query, query_cell), (pair.template, template_cell))
+            features.float().flatten(1).T[cell]
+            for features, cell in ((pair.query, query_cell), (pair.template, template_cell))
         )
-        there = self._nearest(query, query_pair, template, template_pair)
+        forth = self._nearest(query, query_pair, template, template_pair)
         back = self._nearest(template, template_pair, query, query_pair)
         xy = grid_xy(query_cell, width=pair.query.shape[-1]).float()
-        off_cells = torch.linalg.vector_norm(xy - xy[back[there]], dim=1)
-        similarity = (l2_normalize(query) * l2_normalize(template[there])).sum(1)
+        off_cells = torch.linalg.vector_norm(xy - xy[back[forth]], dim=1)
+        similarity = (l2_normalize(query) * l2_normalize(template[forth])).sum(1)
         kept = self._best(off_cells, similarity, query_pair, candidate=torch.isin(query_pair, template_pair))
         if len(kept) == 0:
             raise NoPose("correspond", f"{len(clusters.pairs)} cluster pairs, none with cells on both sides")
         return Correspondences(
             cell_px(query_cell[kept], like=pair.query, crop_size=crop_size),
-            cell_px(template_cell[there[kept]], like=pair.template, crop_size=crop_size),
+            cell_px(template_cell[forth[kept]], like=pair.template, crop_size=crop_size),
             similarity[kept],
             query_pair[kept],
         )

@@ -1,4 +1,4 @@
-"""fused pair, clusters -> corresponding points, in crop pixels: of many mutual neighbours the most salient few."""
+"""fused pair, clusters -> corresponding points, in crop pixels: the most salient of the mutual neighbours."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from pipeline.errors import NoPose
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.similarity import l2_normalize, nearest_with_same_label
 from pipeline.items.features import Clusters, FusedPair
-from pipeline.items.matches import Correspondences
-from pipeline.spec import Fraction, NonNegative, Positive, Spec, spec
-from pipeline.stages.correspond import cell_px, cells_in_pairs
+from pipeline.items.matches import Correspondences, TrueMatches
+from pipeline.spec import Fraction, NonNegative, Positive, spec
+from pipeline.stages.correspond import Corresponder, cell_px, cells_in_pairs
 
 
 @spec
-class Salient(Spec):
-    """Mutual nearest neighbours in paired clusters, put in ``count`` groups by k-means; of each group the most salient.
+class Salient(Corresponder):
+    """Mutual nearest neighbours in paired clusters, grouped by k-means; the most salient pair of each group is kept.
 
     "Best buddies" of Amir et al., "Deep ViT Features as Dense Visual Descriptors", ECCVW 2022, Sec. 4.4, as ZS6D uses
-    them (Ausserlechner et al., ICRA 2024). A group is of pairs whose descriptors, of query and template side by side,
-    are alike; a pair's saliency is the mean of both sides'. Cells below ``threshold`` are background. Unlike ZS6D's
-    own code k-means is seeded, and points are the cells' centres as numbers, not rounded to pixels.
+    them (Ausserlechner et al., ICRA 2024). k-means forms ``count`` groups of the concatenated descriptors of query and
+    template; a pair's saliency is the mean of its two cells'. Cells below ``threshold`` are background. Unlike ZS6D's
+    code, k-means is seeded, and points are the cells' centres, not rounded to pixels.
     """
 
     kind: ClassVar[str] = "correspond.salient"
@@ -35,29 +35,31 @@ class Salient(Spec):
     threshold: Fraction = 0.05
     seed: NonNegative = 0
 
-    def __call__(self, pair: FusedPair, clusters: Clusters, *, crop_size: int) -> Correspondences:
+    def __call__(
+        self, pair: FusedPair, clusters: Clusters, *, crop_size: int, truth: TrueMatches | None = None
+    ) -> Correspondences:
         """Matched points, most salient first. Raises NoPose when there is none."""
-        query_saliency, template_saliency = (_flat(s) for s in (pair.query_saliency, pair.template_saliency))
+        query_saliency, template_saliency = (_flatten(s) for s in (pair.query_saliency, pair.template_saliency))
         query_cell, query_pair = self._salient(clusters.query_label, clusters.pairs[:, 0], query_saliency)
         template_cell, template_pair = self._salient(clusters.template_label, clusters.pairs[:, 1], template_saliency)
         query = l2_normalize(pair.query.float().flatten(1).T[query_cell])
         template = l2_normalize(pair.template.float().flatten(1).T[template_cell])
         similarity, nearest = nearest_with_same_label(query, query_pair, template, template_pair)
         _, back = nearest_with_same_label(template, template_pair, query, query_pair)
-        buddy = ((back[nearest] == torch.arange(len(query), device=query.device)) & (similarity > 0)).nonzero()[:, 0]
-        if not len(buddy):
+        mutual = ((back[nearest] == torch.arange(len(query), device=query.device)) & (similarity > 0)).nonzero()[:, 0]
+        if not len(mutual):
             raise NoPose("correspond", f"no mutual neighbours among {len(query)} and {len(template)} salient cells")
-        other = nearest[buddy]
-        saliency = (query_saliency[query_cell[buddy]] + template_saliency[template_cell[other]]) / 2
+        other = nearest[mutual]
+        saliency = (query_saliency[query_cell[mutual]] + template_saliency[template_cell[other]]) / 2
         group, _ = kmeans(
-            torch.cat([query[buddy], template[other]], 1), count=self.count, seed=self.seed, iterations=100
+            torch.cat([query[mutual], template[other]], 1), count=self.count, seed=self.seed, iterations=100
         )
-        kept = _first_of_each(group, saliency)
+        kept = _best_of_each(group, saliency)
         return Correspondences(
-            cell_px(query_cell[buddy[kept]], like=pair.query, crop_size=crop_size),
+            cell_px(query_cell[mutual[kept]], like=pair.query, crop_size=crop_size),
             cell_px(template_cell[other[kept]], like=pair.template, crop_size=crop_size),
-            similarity[buddy[kept]],
-            query_pair[buddy[kept]],
+            similarity[mutual[kept]],
+            query_pair[mutual[kept]],
         )
 
     def _salient(
@@ -70,13 +72,13 @@ class Salient(Spec):
         return cells[kept], of_pair[kept]
 
 
-def _flat(saliency: Float[Tensor, "h w"] | None) -> Float[Tensor, " k"]:
-    assert saliency is not None, "the route gives saliency to a SalientCorresponder"
+def _flatten(saliency: Float[Tensor, "h w"] | None) -> Float[Tensor, " k"]:
+    assert saliency is not None, "the route adds saliency where needs_saliency is set"
     return saliency.flatten()
 
 
-def _first_of_each(group: Int[Tensor, " m"], value: Float[Tensor, " m"]) -> Int[Tensor, " k"]:
-    """Index of the highest value of each group, highest of all first; of equals the first."""
+def _best_of_each(group: Int[Tensor, " m"], value: Float[Tensor, " m"]) -> Int[Tensor, " k"]:
+    """Index of the highest value of each group, highest first, ties by index."""
     order = torch.sort(value, descending=True, stable=True).indices
     first = torch.full((int(group.max()) + 1,), len(group), dtype=torch.int64, device=group.device)
     rank = torch.arange(len(group), device=group.device)

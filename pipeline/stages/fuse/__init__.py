@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,75 +13,62 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.errors import NoPose
-from pipeline.fits import Fit, Fitted
 from pipeline.functional.masks import cell_mask, foreground
-from pipeline.items.features import FusedPair
-from pipeline.spec import NonNegative, Variant
+from pipeline.items.features import CropFeatures, FittedArrays, FusedPair
+from pipeline.items.fit import Fit
+from pipeline.spec import NonNegative, Spec
 
 Layers = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
+Encoded = TypeVar("Encoded")
 
 
-class Fuser(Variant, Protocol):
-    """What a fuse variant is. ``layers``: the decoder layers it needs; masks are those of the crops (S S)."""
+@dataclass(frozen=True, eq=False)
+class EncodedMap:
+    """One image's fused map and its foreground cells. ``note``: what was clamped, "" for nothing."""
+
+    features: Float[Tensor, "d h w"]
+    mask: Bool[Tensor, "h w"]
+    note: str = ""
+
+
+class Fuser(Spec, ABC, Generic[Encoded]):
+    """Contract of a fuse variant: ``encode`` runs once per image and is memoised, ``pair`` once per template match.
+
+    ``layers``: the decoder layers it reads. ``joint``: True where a map of the pair depends on both images; then
+    ``encode`` hands its input on, and what is computed from such a map cannot be reused for another pair.
+    """
 
     layers: tuple[int, ...]
-
-    def __call__(
-        self,
-        query: Mapping[int, Float[Tensor, "c h w"]],
-        template: Mapping[int, Float[Tensor, "c h w"]],
-        query_mask: Bool[Tensor, "S S"],
-        template_mask: Bool[Tensor, "S S"],
-    ) -> FusedPair:
-        """Fused maps at the resolution of the finest layer. Raises NoPose when a mask has no cell."""
-        ...
-
-
-@runtime_checkable
-class TrainedFuser(Protocol):
-    """One that was trained on the features of one model."""
-
-    def check(self, model: str) -> None:
-        """Raise BadInput for features of another ``model`` (an extractor's)."""
-        ...
-
-
-@runtime_checkable
-class SidedFuser(Protocol):
-    """One whose map of a side depends on that side alone: a query's is made once for all its templates."""
-
-    def side(self, features: Mapping[int, Float[Tensor, "c h w"]]) -> Float[Tensor, "d h w"]:
-        """The map of one side."""
-        ...
-
-
-@runtime_checkable
-class FittedFuser(Protocol):
-    """A fuser that stands on something fitted to the object's templates."""
+    joint: ClassVar[bool] = False
 
     @property
-    def fit(self) -> Fit:
-        """What it stands on."""
-        ...
+    def fit(self) -> Fit | None:
+        """What is fitted to the object's templates offline."""
+        return None
 
-    def by_fitted(
-        self,
-        query: Mapping[int, Float[Tensor, "c h w"]],
-        template: Mapping[int, Float[Tensor, "c h w"]],
-        query_mask: Bool[Tensor, "S S"],
-        template_mask: Bool[Tensor, "S S"],
-        fitted: Fitted,
-    ) -> FusedPair:
-        """Fused maps. Raises NoPose when a mask has no cell."""
-        ...
+    def check(self, model: str) -> None:
+        """Raise BadInput where the variant was trained on features of another model than the extractor's ``model``."""
+        return
+
+    @abstractmethod
+    def encode(self, crop: CropFeatures, fitted: FittedArrays) -> Encoded:
+        """What ``pair`` needs of one image. ``fitted``: arrays of ``fit``, empty without one. Raises NoPose."""
+
+    @abstractmethod
+    def pair(self, query: Encoded, template: Encoded) -> FusedPair:
+        """Fused maps at the resolution of the finest layer. Raises NoPose for a mask without a cell."""
+
+    def __call__(self, query: CropFeatures, template: CropFeatures, fitted: FittedArrays | None = None) -> FusedPair:
+        """Encode both images and pair them."""
+        return self.pair(self.encode(query, fitted or {}), self.encode(template, fitted or {}))
 
 
 def finest(maps: Mapping[int, Float[Tensor, "c h w"]], layers: Sequence[int]) -> int:
-    """Cells a side of the finest of the layers' maps."""
+    """Cells per side of the finest of the layers' maps."""
     return max(maps[layer].shape[-1] for layer in layers)
 
 
-def samples(
+def sample_cells(
     query: Float[Tensor, "c h w"],
     template: Float[Tensor, "c h w"],
     masks: tuple[Bool[Tensor, "S S"], Bool[Tensor, "S S"]] | None,
@@ -91,34 +80,44 @@ def samples(
     Raises NoPose for an empty mask and for features that are not finite.
     """
     if masks is None:
-        sides = [query.flatten(1), template.flatten(1)]
+        cells = [query.flatten(1), template.flatten(1)]
     else:
-        inside = _cell_masks(*masks, cells=query.shape[-1])
+        inside = _mask_cells(*masks, cells=query.shape[-1])
         pairs = zip((query, template), inside, strict=True)
-        sides = [side.flatten(1).index_select(1, foreground(mask)) for side, mask in pairs]
-    both = torch.cat(sides, dim=1).T
+        cells = [features.flatten(1).index_select(1, foreground(mask)) for features, mask in pairs]
+    both = torch.cat(cells, dim=1).T
     if not bool(torch.isfinite(both.sum(0)).all()):  # one value that is not finite makes its sum so
         raise NoPose("fuse", f"features of layer {layer} are not finite")
     return both
 
 
-def fused(
+def pair_maps(
     query: Float[Tensor, "d h w"],
     template: Float[Tensor, "d h w"],
     query_mask: Bool[Tensor, "S S"],
     template_mask: Bool[Tensor, "S S"],
     note: str = "",
 ) -> FusedPair:
-    """The pair with its masks at the maps' resolution. Raises NoPose for an empty mask."""
-    of_query, of_template = _cell_masks(query_mask, template_mask, cells=query.shape[-1])
-    return FusedPair(query, template, of_query, of_template, note)
+    """The maps with the crops' masks brought to their resolution. Raises NoPose for an empty mask."""
+    masks = _mask_cells(query_mask, template_mask, cells=query.shape[-1])
+    return FusedPair(query, template, *masks, note)
 
 
-def _cell_masks(
+def pair_encoded(query: EncodedMap, template: EncodedMap) -> FusedPair:
+    """Two maps that were encoded independently. Raises NoPose for a mask without a cell."""
+    _require_cells(query.mask, template.mask)
+    return FusedPair(query.features, template.features, query.mask, template.mask, query.note)
+
+
+def _mask_cells(
     query_mask: Bool[Tensor, "S S"], template_mask: Bool[Tensor, "S S"], *, cells: int
 ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
     masks = cell_mask(query_mask, cells=cells), cell_mask(template_mask, cells=cells)
-    for name, mask in zip(("query", "template"), masks, strict=True):
+    _require_cells(*masks)
+    return masks
+
+
+def _require_cells(query_mask: Bool[Tensor, "h w"], template_mask: Bool[Tensor, "h w"]) -> None:
+    for name, mask in (("query", query_mask), ("template", template_mask)):
         if not mask.any():
             raise NoPose("fuse", f"{name} mask is empty, needs 1 pixel")
-    return masks

@@ -1,4 +1,4 @@
-"""query and template features -> one map each, in whatever way suits the features."""
+"""query and template features -> one map each, by the variant that suits the features."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pipeline.stages.fuse.pca import Pca
 
 @spec
 class Auto(Spec):
-    """``Learned`` for the features its head was trained on, with edges, ``Pca`` for all others.
+    """``Learned`` with edges for the features its head was trained on, ``Pca`` for all others.
 
-    Keys are those of the one taken.
+    Keys are those of the chosen variant.
     """
 
     kind: ClassVar[str] = "fuse.auto"
@@ -26,4 +26,4 @@ class Auto(Spec):
         """The variant for features of an extractor's ``model``."""
         if not Learned.suits(model):
             return Pca(layers=self.layers)
-        return Learned() if self.layers == LAYERS else Learned(layers=self.layers)  # which its check refuses by name
+        return Learned() if self.layers == LAYERS else Learned(layers=self.layers)  # whose check names valid ones

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
 from pydantic import Field
-from torch import Tensor
 
 from pipeline.errors import NoPose
-from pipeline.fits import Fitted, fitted_to, foreground_cells
-from pipeline.fits.projection import Projection, on_axes
-from pipeline.items.features import FusedPair
-from pipeline.spec import NonNegative, Positive, Spec, spec
-from pipeline.stages.fuse import fused
+from pipeline.fits.projection import Projection, project_map
+from pipeline.functional.masks import cell_mask
+from pipeline.items.features import CropFeatures, FittedArrays, FusedPair
+from pipeline.spec import NonNegative, Positive, spec
+from pipeline.stages.fuse import EncodedMap, Fuser, pair_encoded
 
 
 @spec
-class TemplatePca(Spec):
+class TemplatePca(Fuser[EncodedMap]):
     """One layer, projected by a PCA that was fitted offline to the foreground of all templates of the object.
 
-    Örnek et al., "FoundPose", ECCV 2024, section 3.1. Unlike fuse=pca, every pair of an object meets in one space, and
-    nothing is decomposed online. ``layers`` names a single layer.
+    Örnek et al., "FoundPose", ECCV 2024, section 3.1. Unlike fuse=pca, all pairs of an object share one space and no
+    decomposition runs online. ``layers`` names a single layer.
     """
 
     kind: ClassVar[str] = "fuse.template_pca"
@@ -37,34 +34,18 @@ class TemplatePca(Spec):
         """The axes."""
         return Projection(layer=self.layers[0], dim=self.dim)
 
-    def __call__(
-        self,
-        query: Mapping[int, Float[Tensor, "c h w"]],
-        template: Mapping[int, Float[Tensor, "c h w"]],
-        query_mask: Bool[Tensor, "S S"],
-        template_mask: Bool[Tensor, "S S"],
-    ) -> FusedPair:
-        """As ``by_fitted``, fitted here and now to the one template that it is given."""
-        maps = template[self.layers[0]]
-        arrays = fitted_to(self.fit, foreground_cells(maps[None], template_mask[None]))
-        on_device = {name: array.to(maps.device) for name, array in arrays.items()}
-        return self.by_fitted(query, template, query_mask, template_mask, on_device)
+    def encode(self, crop: CropFeatures, fitted: FittedArrays) -> EncodedMap:
+        """The projected map; ``note`` says where the templates span fewer dimensions than ``dim``.
 
-    def by_fitted(
-        self,
-        query: Mapping[int, Float[Tensor, "c h w"]],
-        template: Mapping[int, Float[Tensor, "c h w"]],
-        query_mask: Bool[Tensor, "S S"],
-        template_mask: Bool[Tensor, "S S"],
-        fitted: Fitted,
-    ) -> FusedPair:
-        """Fused maps; ``note`` says where the templates span fewer dimensions than asked for.
-
-        Raises NoPose for an empty mask and for features that are not finite.
+        Raises NoPose for features that are not finite.
         """
-        layer, kept = self.layers[0], fitted["axes"].shape[1]
-        if not all(bool(torch.isfinite(side[layer]).all()) for side in (query, template)):
+        layer, dim = self.layers[0], fitted["axes"].shape[1]
+        if not bool(torch.isfinite(crop.maps[layer]).all()):
             raise NoPose("fuse", f"features of layer {layer} are not finite")
-        query_map, template_map = (on_axes(side[layer], fitted) for side in (query, template))
-        note = f"layer {layer}: {kept} of {self.dim} dimensions, the templates span no more" if kept < self.dim else ""
-        return fused(query_map, template_map, query_mask, template_mask, note=note)
+        features = project_map(crop.maps[layer], fitted)
+        note = f"layer {layer}: {dim} of {self.dim} dimensions, the templates span no more" if dim < self.dim else ""
+        return EncodedMap(features, cell_mask(crop.mask, cells=features.shape[-1]), note)
+
+    def pair(self, query: EncodedMap, template: EncodedMap) -> FusedPair:
+        """Fused maps. Raises NoPose for an empty mask."""
+        return pair_encoded(query, template)

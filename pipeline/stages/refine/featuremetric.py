@@ -1,4 +1,4 @@
-"""pose, fused pair, template's object points -> the pose under which the query shows the template's descriptors."""
+"""pose, fused pair -> the pose under which the query's descriptors match the template's best."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from pipeline.functional.featuremetric import (
     normal_equations,
     robust_scale,
 )
-from pipeline.items.features import FusedPair
-from pipeline.spec import NonNegative, NonNegativeFloat, Positive, PositiveFloat, Spec, spec
+from pipeline.items.features import PairGeometry
+from pipeline.spec import NonNegative, NonNegativeFloat, Positive, PositiveFloat, spec
+from pipeline.stages.refine import Refiner
 
 ALPHA = {"barron": -5.0, "cauchy": 0.0, "geman_mcclure": -2.0}
 MIN_POINTS = 6
 
 
 @spec
-class Featuremetric(Spec):
+class Featuremetric(Refiner):
     """Featuremetric refinement of FoundPose (Örnek et al., ECCV 2024).
 
-    Least mean, over the template's foreground cells i, of rho(|d_i - F(x_i)|^2): d_i the cell's descriptor, x_i where
-    its object point lands in the query under the pose, F the query's fused map, bilinear. Levenberg-Marquardt with
-    analytic Jacobians, ``iterations`` at most on each of ``sigmas_cells``: Gaussian blurs, coarse to fine, that widen
-    the basin. ``loss``: Barron's with alpha -5, Cauchy's, Geman-McClure's; its scale is ``scale`` times the median
-    residual at the start of each level. ``normalise``: descriptors have unit length before any blur. Of more than
-    ``max_points`` cells, that many are drawn with ``seed``.
+    Minimises the mean of rho(|d_i - F(x_i)|^2) over the template's foreground cells i: d_i is the cell's descriptor,
+    x_i the projection of its object point into the query, F the query's fused map (bilinear). Levenberg-Marquardt with
+    analytic Jacobians, at most ``iterations`` per level of ``sigmas_cells``: Gaussian blurs, coarse to fine, that widen
+    the basin of convergence. ``loss``: Barron with alpha -5, Cauchy, or Geman-McClure; its scale is ``scale`` times
+    the median residual at the start of each level. ``normalise``: descriptors have unit length before blurring.
+    ``max_points``: larger sets of cells are sampled with ``seed``.
 
-    Departures: the blurs; the maps are blurred and continued over silhouettes by their foreground alone; a cell that
-    leaves the query's mask costs what its distance to a mean foreground cell costs. The pose given comes back unless
-    the unblurred (the last level's) mean cost falls.
+    Departures from the paper: the blurs; maps are blurred and extrapolated across silhouettes from the foreground
+    only; a cell outside the query's mask costs its distance to a mean foreground cell. The input pose is returned
+    unless the mean cost of the last level falls.
     """
 
     kind: ClassVar[str] = "refine.featuremetric"
@@ -52,23 +53,16 @@ class Featuremetric(Spec):
     max_points: Positive = 1000
     seed: NonNegative = 0
 
-    def __call__(
-        self,
-        T_cam_obj: Float[np.ndarray, "4 4"],
-        pair: FusedPair,
-        points_obj: Float[np.ndarray, "m 3"],
-        K_crop: Float[np.ndarray, "3 3"],
-        *,
-        crop_size: int,
-    ) -> Float[np.ndarray, "4 4"]:
-        """T_cam_obj (mm) of lower cost, or the one given: also where fewer than 6 cells have a point."""
+    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], geometry: PairGeometry) -> Float[np.ndarray, "4 4"]:
+        """A pose (mm) of lower cost, or the one given; the latter also where fewer than 6 cells have a point."""
+        pair = geometry.pair
         query, template = self._descriptors(pair.query), self._descriptors(pair.template)
         query_mask, template_mask = pair.query_mask.cpu().numpy(), pair.template_mask.cpu().numpy()
-        chosen = self._chosen(points_obj)
-        if len(chosen) < MIN_POINTS or not query_mask.any():
+        rows = self._choose_rows(geometry.points_obj)
+        if len(rows) < MIN_POINTS or not query_mask.any():
             return T_cam_obj
-        cell, points = np.flatnonzero(template_mask)[chosen], points_obj[chosen]
-        K_cell = cell_affine(size=crop_size, cells=query_mask.shape[-1]) @ K_crop
+        cell, points = np.flatnonzero(template_mask)[rows], geometry.points_obj[rows]
+        K_cell = cell_affine(size=geometry.crop_size, cells=query_mask.shape[-1]) @ geometry.K_crop
         T = T_cam_obj
         for sigma in self.sigmas_cells:
             surface, field = build_level(
@@ -91,8 +85,8 @@ class Featuremetric(Spec):
         maps = np.ascontiguousarray(features.float().movedim(0, -1).cpu().numpy())
         return l2_normalize(maps) if self.normalise else maps
 
-    def _chosen(self, points_obj: Float[np.ndarray, "m 3"]) -> np.ndarray:
-        """Rows with a point, in order; no more than ``max_points``."""
+    def _choose_rows(self, points_obj: Float[np.ndarray, "m 3"]) -> np.ndarray:
+        """Rows with a point, in order; at most ``max_points``."""
         rows = np.flatnonzero(np.isfinite(points_obj).all(1))
         if len(rows) <= self.max_points:
             return rows

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Protocol
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from pydantic import Field
 
 from pipeline.errors import NoPose
 from pipeline.functional.pnp import polish, reprojection_error_px
 from pipeline.items.poses import PoseSolution
-from pipeline.spec import Variant
+from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
 
 Confidence = Annotated[float, Field(gt=0, lt=1)]
 Plane = Literal["image", "crop"]
-PnpPoints = Annotated[int, Field(ge=4)]  # three points leave up to four poses
+PnpPoints = Annotated[int, Field(ge=4)]  # three points allow up to four poses
 
 
-class Solver(Variant, Protocol):
-    """What a solve variant is.
+@spec
+class Solver(Spec, ABC):
+    """Contract of a solve variant.
 
-    ``plane``: whose pixels and camera it is given, and so whose pixels its threshold means: the full ``image``'s, or
-    the ``crop``'s, where a threshold is the same part of every object, near or far.
+    ``plane``: whose pixels and camera it is given, and so what its threshold is measured in: the full ``image``'s, or
+    the ``crop``'s, where a threshold is the same share of every object, near or far.
     """
 
-    plane: Plane
+    plane: Plane = "image"
 
+    @abstractmethod
     def __call__(
         self,
         points_obj: Float[np.ndarray, "m 3"],
@@ -34,46 +37,54 @@ class Solver(Variant, Protocol):
         K: Float[np.ndarray, "3 3"],
     ) -> PoseSolution:
         """T_cam_obj (mm) from pixels of the camera K. Raises NoPose when no pose is supported by enough inliers."""
-        ...
 
 
-def usable(
-    points_obj: Float[np.ndarray, "m 3"], px_img: Float[np.ndarray, "m 2"], *, needed: int
-) -> Bool[np.ndarray, " m"]:
-    """Correspondences without NaN or infinity. Raises NoPose for fewer than ``needed``."""
-    finite = np.isfinite(points_obj).all(1) & np.isfinite(px_img).all(1)
-    if finite.sum() < needed:
-        raise NoPose("solve", f"{finite.sum()} correspondences, PnP needs {needed}")
-    return finite
+@spec
+class RansacSolver(Solver):
+    """Fields and steps that RANSAC solvers share.
 
-
-def solution(
-    T_cam_obj: Float[np.ndarray, "4 4"] | None,
-    points_obj: Float[np.ndarray, "m 3"],
-    px_img: Float[np.ndarray, "m 2"],
-    K: Float[np.ndarray, "3 3"],
-    *,
-    threshold_px: float,
-    min_inliers: int,
-    refine: bool,
-) -> PoseSolution:
-    """A solver's pose, polished when ``refine``, judged by its own reprojection: inliers are counted anew.
-
-    Rows that are not finite are no inliers. Raises NoPose for no pose and for one with too few inliers.
+    ``threshold_px``: an inlier's largest reprojection error. ``refine``: Levenberg-Marquardt on the inliers, kept only
+    where it lowers the truncated squared error. ``seed``: of the draws.
     """
-    finite = np.isfinite(points_obj).all(1) & np.isfinite(px_img).all(1)
-    points, px = points_obj[finite], px_img[finite]
-    if T_cam_obj is None:
-        raise NoPose("solve", f"no pose brings {min_inliers} of {len(points)} points within {threshold_px:g} px")
-    if refine:
-        T_cam_obj = polish(points, px, K, T_cam_obj, threshold_px=threshold_px)
-    error = reprojection_error_px(points, px, K, T_cam_obj)
-    near = error < threshold_px
-    if near.sum() < min_inliers:
-        raise NoPose(
-            "solve",
-            f"best pose has {near.sum()} of {len(points)} points within {threshold_px:g} px, needs {min_inliers}",
-        )
-    inliers = np.zeros(len(points_obj), dtype=bool)
-    inliers[finite] = near
-    return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error[near] ** 2))))
+
+    iterations: Positive = 400
+    threshold_px: PositiveFloat = 8.0
+    confidence: Confidence = 0.999
+    min_inliers: PnpPoints = 6
+    refine: bool = True
+    seed: NonNegative = 0
+
+    @abstractmethod
+    def ransac(
+        self, points_obj: Float[np.ndarray, "m 3"], px_img: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"]
+    ) -> Float[np.ndarray, "4 4"] | None:
+        """T_cam_obj (mm) of finite correspondences, None when no sample gives one."""
+
+    def __call__(
+        self,
+        points_obj: Float[np.ndarray, "m 3"],
+        px_img: Float[np.ndarray, "m 2"],
+        K: Float[np.ndarray, "3 3"],
+    ) -> PoseSolution:
+        """The pose with its inliers, counted by reprojection; rows that are not finite are none.
+
+        Raises NoPose for too few correspondences, for no pose, and for one with too few inliers.
+        """
+        finite = np.isfinite(points_obj).all(1) & np.isfinite(px_img).all(1)
+        if finite.sum() < self.min_inliers:
+            raise NoPose("solve", f"{finite.sum()} correspondences, PnP needs {self.min_inliers}")
+        points, px = points_obj[finite], px_img[finite]
+        T_cam_obj = self.ransac(points, px, K)
+        if T_cam_obj is None:
+            limit = f"within {self.threshold_px:g} px"
+            raise NoPose("solve", f"no pose brings {self.min_inliers} of {len(points)} points {limit}")
+        if self.refine:
+            T_cam_obj = polish(points, px, K, T_cam_obj, threshold_px=self.threshold_px)
+        error_px = reprojection_error_px(points, px, K, T_cam_obj)
+        near = error_px < self.threshold_px
+        if near.sum() < self.min_inliers:
+            found = f"best pose has {near.sum()} of {len(points)} points within {self.threshold_px:g} px"
+            raise NoPose("solve", f"{found}, needs {self.min_inliers}")
+        inliers = np.zeros(len(points_obj), dtype=bool)
+        inliers[finite] = near
+        return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px[near] ** 2))))

@@ -10,55 +10,30 @@ from jaxtyping import Float
 
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import nearest_rotation, rigid
-from pipeline.items.poses import PoseSolution
-from pipeline.spec import NonNegative, Positive, PositiveFloat, Spec, spec
-from pipeline.stages.solve import Confidence, Plane, PnpPoints, solution, usable
+from pipeline.spec import Positive, spec
+from pipeline.stages.solve import RansacSolver
 
 
 @spec
-class Poselib(Spec):
+class Poselib(RansacSolver):
     """P3P in locally optimised RANSAC (Larsson, PoseLib).
 
-    An optional extra. ``refine``: polished on the inliers as solve=epnp is; PoseLib's own local optimisation always
-    runs inside its RANSAC.
+    An optional extra. PoseLib's own local optimisation runs inside its RANSAC whatever ``refine`` says.
     """
 
     kind: ClassVar[str] = "solve.poselib"
     version: ClassVar[int] = 2
 
     iterations: Positive = 1000
-    threshold_px: PositiveFloat = 8.0
-    confidence: Confidence = 0.999
-    min_inliers: PnpPoints = 6
-    refine: bool = True
-    seed: NonNegative = 0
-    plane: Plane = "image"
 
     def __post_init__(self) -> None:
         if find_spec("poselib") is None:
             raise BadInput("solve=poselib", found="no package poselib", needed="pip install 'dzop[poselib]'")
 
-    def __call__(
-        self,
-        points_obj: Float[np.ndarray, "m 3"],
-        px_img: Float[np.ndarray, "m 2"],
-        K: Float[np.ndarray, "3 3"],
-    ) -> PoseSolution:
-        """T_cam_obj (mm). Raises NoPose for too few correspondences and for poses with too few inliers."""
-        finite = usable(points_obj, px_img, needed=self.min_inliers)
-        return solution(
-            self._ransac(points_obj[finite], px_img[finite], K),
-            points_obj,
-            px_img,
-            K,
-            threshold_px=self.threshold_px,
-            min_inliers=self.min_inliers,
-            refine=self.refine,
-        )
-
-    def _ransac(
+    def ransac(
         self, points_obj: Float[np.ndarray, "m 3"], px_img: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "4 4"] | None:
+        """See RansacSolver."""
         import poselib
 
         camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
