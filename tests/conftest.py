@@ -23,12 +23,12 @@ TEST_DATA = Path(os.environ.get("DZOP_TEST_DATA") or ROOT.parent / "shared" / "b
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """What tests counted: ``record_property("told", ...)``."""
+    """Print what tests recorded with ``record_property("summary", ...)``."""
     reports = terminalreporter.getreports("passed")
-    told = [value for report in reports for name, value in report.user_properties if name == "told"]
-    if told:
+    summaries = [value for report in reports for name, value in report.user_properties if name == "summary"]
+    if summaries:
         terminalreporter.section("counted")
-        for line in dict.fromkeys(told):
+        for line in dict.fromkeys(summaries):
             terminalreporter.write_line(line)
 
 

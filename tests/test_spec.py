@@ -41,7 +41,7 @@ def test_nested_specs_enter_with_kind_and_version():
     assert Outer(first=Toy()).recipe()["first"] == Toy().recipe()
 
 
-def test_one_and_its_lookalikes_have_different_digests():
+def test_values_of_different_types_have_different_digests():
     assert len({digest({"x": value}) for value in (1, 1.0, True, "1", [1], None)}) == 6
 
 
@@ -49,11 +49,11 @@ def test_the_order_of_fields_does_not_matter():
     assert canonical({"b": 1, "a": 2}) == canonical({"a": 2, "b": 1}) == '{"a":2,"b":1}'
 
 
-def test_a_whole_number_for_a_float_is_that_float():
+def test_an_integer_for_a_float_is_converted():
     assert digest(build(Toy, {"weight": 2}, where="match").recipe()) == digest(Toy(weight=2.0).recipe())
 
 
-def test_specs_cannot_be_changed():
+def test_specs_are_frozen():
     with pytest.raises(AttributeError):
         Toy().layer = 3  # type: ignore[misc]
 
@@ -71,18 +71,18 @@ def test_specs_cannot_be_changed():
         ({"top": 5}, "match.top: found an unknown field, needs one of: layer, weight, layers, mode, flag"),
     ],
 )
-def test_a_wrong_field_is_told_in_one_line(values: dict, message: str):
+def test_an_invalid_field_is_reported_in_one_line(values: dict, message: str):
     with pytest.raises(BadInput) as error:
         build(Toy, values, where="match")
     assert str(error.value) == message
 
 
 def test_a_missing_field_is_named():
-    with pytest.raises(BadInput, match=r"outer\.first"):
+    with pytest.raises(BadInput, match=r"outer\.first: found nothing, needs a value"):
         build(Outer, {}, where="outer")
 
 
-def test_too_many_and_too_few_values_are_counted():
+def test_too_many_and_too_few_values_are_reported():
     with pytest.raises(BadInput, match=r"fuse.layers: found \[2, 5\], needs at most 1 value$"):
         build(TemplatePca, {"layers": [2, 5]}, where="fuse")
     with pytest.raises(BadInput, match=r"fuse.layers: found \[\], needs at least 1 value$"):

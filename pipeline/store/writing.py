@@ -120,9 +120,8 @@ def open_or_create_group(backend: Backend, ref: Ref, attributes: Mapping[str, An
     with _lock_parent_groups(backend, ref, announce):
         keys, group = list_keys(backend.zarr, ref.path), open_group(backend.zarr, ref.path)
         if group is not None and _has_identity(group, ref):
-            for key in keys:
-                if key.endswith(".partial"):
-                    sync(backend.zarr.delete(key))
+            for key in [key for key in keys if key.endswith(".partial")]:
+                sync(backend.zarr.delete(key))
             return group
         if keys:
             sync(backend.zarr.delete_dir(ref.path))

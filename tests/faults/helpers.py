@@ -87,12 +87,12 @@ def _command(folder: str, arguments: list[str], name: str) -> None:
 class Reference:
     """Results of an undisturbed run: the folder after each step, and the seconds each step took.
 
-    ``alone``: the folder of a single ``step=evaluate`` on an empty cache.
+    ``single``: the folder of a single ``step=evaluate`` on an empty cache.
     """
 
     after: dict[str, Path]
     seconds: dict[str, float]
-    alone: Path
+    single: Path
 
     def before(self, step: str) -> Path | None:
         at = STEPS.index(step)
@@ -121,21 +121,21 @@ def run_reference(inputs: Inputs, folder: Path) -> Reference:
         seconds[step] = time.monotonic() - start
         assert ended.status == 0, ended.err
         after[step] = run
-    whole = stored(after["evaluate"])
-    assert {path.split("/")[0] for path in whole} == set(KINDS)
+    expected = read_entries(after["evaluate"])
+    assert {path.split("/")[0] for path in expected} == set(KINDS)
     poses = json.loads(next((after["evaluate"] / "results").glob("*/*/poses.json")).read_text())["answers"]
     assert [answer["status"] for answer in poses] == ["estimate"] * 4
-    (folder / "alone").mkdir()
-    assert inputs.run(folder / "alone").status == 0
-    assert stored(folder / "alone").items() <= whole.items()
-    return Reference(after, seconds, folder / "alone")
+    (folder / "single").mkdir()
+    assert inputs.run(folder / "single").status == 0
+    assert read_entries(folder / "single").items() <= expected.items()
+    return Reference(after, seconds, folder / "single")
 
 
 def store_of(folder: Path) -> Store:
     return Store(LocalStoreConfig(root=str(folder / "cache")))
 
 
-def stored(folder: Path) -> dict[str, bytes]:
+def read_entries(folder: Path) -> dict[str, bytes]:
     """Every array and document of the store's complete entries, without measured seconds.
 
     Raises DamagedEntry for an entry that is recorded as complete but is damaged.
@@ -155,7 +155,7 @@ def remove_times(value: Any) -> Any:
     return [remove_times(item) for item in value] if isinstance(value, list) else value
 
 
-def written(folder: Path, out: str = "results") -> dict[str, Any]:
+def read_results(folder: Path, out: str = "results") -> dict[str, Any]:
     """The results files without measured seconds; none may be truncated."""
     found: dict[str, Any] = {}
     for path in sorted((folder / out).rglob("*")):

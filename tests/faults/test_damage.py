@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers import KINDS, Ended, Inputs, Reference, store_of, stored, written
+from helpers import KINDS, Ended, Inputs, Reference, read_entries, read_results, store_of
 
 from pipeline.cli.cache import cache_command
 from pipeline.errors import DzopError
@@ -62,25 +62,25 @@ def run_both(inputs: Inputs, folder: Path) -> Ended:
 
 def repair(inputs: Inputs, reference: Reference, folder: Path, harm: str, *, runs: int = 3) -> int:
     """Repeat the commands, as their message advises, until everything is repaired. Returns the number of runs."""
-    whole, results = stored(reference.after["evaluate"]), written(reference.after["evaluate"])
+    expected, results = read_entries(reference.after["evaluate"]), read_results(reference.after["evaluate"])
     count, ended = 1, run_both(inputs, folder)
     while ended.status != 0 and count < runs:
         assert "run again to recompute only what is damaged" in ended.err, (harm, ended.err)
         assert len(ended.err.splitlines()) == 1, ended.err
         count, ended = count + 1, run_both(inputs, folder)
     assert ended.status == 0, (harm, ended.err)
-    assert written(folder) == results, harm
+    assert read_results(folder) == results, harm
     verify(store_of(folder))  # marks damage in entries that this run did not read; the next run repairs it
     for kind in ("detections", *DOWNSTREAM):
         shutil.rmtree(folder / "cache" / kind)
     again = run_both(inputs, folder)
     assert again.status == 0, (harm, again.err)
-    left = stored(folder)
-    assert left.items() <= whole.items(), harm
-    lacking = {entry.path for entry in list_entries(store_of(folder)) if not entry.complete}
-    assert {name for name in whole if not any(name.startswith(path) for path in lacking)} == left.keys(), harm
-    assert len(lacking) <= 1, harm  # crops that no step reads, since their features are stored
-    assert written(folder) == results, harm
+    left = read_entries(folder)
+    assert left.items() <= expected.items(), harm
+    incomplete = {entry.path for entry in list_entries(store_of(folder)) if not entry.complete}
+    assert {name for name in expected if not any(name.startswith(path) for path in incomplete)} == left.keys(), harm
+    assert len(incomplete) <= 1, harm  # crops that no step reads, since their features are stored
+    assert read_results(folder) == results, harm
     return count
 
 
@@ -99,7 +99,7 @@ def test_damage_to_an_entry_is_detected_and_repaired(
         runs.append(repair(inputs, reference, folder, damage(folder / "cache", kind, name, rng)))
         shutil.rmtree(folder)
     record_property(
-        "told", f"{kind}: {len(runs)} files damaged, {len(runs)} repaired, {runs.count(1)} by the first run"
+        "summary", f"{kind}: {len(runs)} files damaged, {len(runs)} repaired, {runs.count(1)} by the first run"
     )
 
 
@@ -110,7 +110,7 @@ def test_damage_to_every_kind_of_entry_at_once_is_detected_and_repaired(
     reference.copy(folder, reference.after["evaluate"])
     harms = [damage(folder / "cache", kind, "flipped byte", rng) for kind in KINDS]
     runs = repair(inputs, reference, folder, "; ".join(harms), runs=len(KINDS) + 1)
-    record_property("told", f"{len(harms)} bytes flipped, one in an entry of every kind: repaired by run {runs}")
+    record_property("summary", f"{len(harms)} bytes flipped, one in an entry of every kind: repaired by run {runs}")
 
 
 def test_the_cache_commands_survive_any_damage(reference: Reference, folder: Path, capsys):
@@ -136,7 +136,7 @@ def test_a_flipped_byte_in_metadata_never_changes_what_is_read(
     reference: Reference, folder: Path, kind, count, record_property
 ):
     reference.copy(folder, reference.after["evaluate"])
-    whole, rng, read = stored(folder), random.Random(count), 0
+    expected, rng, read = read_entries(folder), random.Random(count), 0
     for other in set(KINDS) - {kind}:
         shutil.rmtree(folder / "cache" / other)
     intact = folder.parent / "intact"
@@ -144,13 +144,13 @@ def test_a_flipped_byte_in_metadata_never_changes_what_is_read(
     for _ in range(count):
         flip(rng.choice([p for p in files_of(folder / "cache", kind) if p.name == "zarr.json"]), rng)
         try:
-            left = stored(folder)
+            left = read_entries(folder)
         except DamagedEntry:
             left = {}
-        assert all(whole[name] == value for name, value in left.items())
+        assert all(expected[name] == value for name, value in left.items())
         read += len(left) > 0
         shutil.rmtree(folder / "cache")
         shutil.copytree(intact, folder / "cache")
     record_property(
-        "told", f"{count} bytes flipped in metadata of {kind}: none changed a value, {count - read} hid all entries"
+        "summary", f"{count} bytes flipped in metadata of {kind}: none changed a value, {count - read} hid all entries"
     )

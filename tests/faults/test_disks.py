@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from helpers import Inputs, Reference, store_of, stored, written
+from helpers import Inputs, Reference, read_entries, read_results, store_of
 
 import pipeline.io.digests
 import pipeline.store.completion
@@ -49,8 +49,8 @@ def disk(tmp_path: Path):
 def test_a_full_disk_is_reported_and_the_run_resumes_once_there_is_room(
     inputs: Inputs, reference: Reference, disk: Disk, shares, record_property
 ):
-    whole, results = stored(reference.alone), written(reference.alone)
-    folder = reference.copy(disk.at / "run", reference.alone)
+    expected, results = read_entries(reference.single), read_results(reference.single)
+    folder = reference.copy(disk.at / "run", reference.single)
     needed = disk.used()
     for share in shares:
         shutil.rmtree(folder)
@@ -62,14 +62,14 @@ def test_a_full_disk_is_reported_and_the_run_resumes_once_there_is_room(
         assert ended.status == 1
         assert len(ended.err.splitlines()) == 1, ended.err
         assert "the disk is full; make room" in ended.err, ended.err
-        assert all(whole[name] == value for name, value in stored(folder).items())
+        assert all(expected[name] == value for name, value in read_entries(folder).items())
         disk.remount("size=256m")
         again = inputs.run(folder)
         assert again.status == 0, again.err
-        assert stored(folder) == whole
-        assert written(folder) == results
+        assert read_entries(folder) == expected
+        assert read_results(folder) == results
     record_property(
-        "told",
+        "summary",
         f"{len(shares)} disks full at {shares[0]:.0%} to {shares[-1]:.0%} of what a run takes: {len(shares)} recovered",
     )
 
@@ -78,11 +78,11 @@ def test_a_read_only_store_is_read_and_the_missing_entry_is_named(
     inputs: Inputs, reference: Reference, disk: Disk, folder: Path
 ):
     folder.mkdir()
-    shutil.copytree(reference.alone / "cache", disk.at / "cache")
+    shutil.copytree(reference.single / "cache", disk.at / "cache")
     disk.remount("ro")
     ended = inputs.run(folder, "evaluate", f"store.root={disk.at / 'cache'}")
     assert ended.status == 0, ended.err
-    assert written(folder) == written(reference.alone)
+    assert read_results(folder) == read_results(reference.single)
     disk.remount("rw")
     shutil.rmtree(disk.at / "cache" / "features")
     (chunk,) = list((disk.at / "cache" / "crops").rglob("rgb/c/1/0/0/0"))[:1]
@@ -105,13 +105,13 @@ def test_an_unwritable_results_folder_is_reported_before_anything_is_computed(in
     ended = inputs.run(folder, "evaluate", f"out={disk.at / 'results'}")
     assert ended.status == 1
     assert "needs a folder to write to" in ended.err
-    assert not stored(folder)
+    assert not read_entries(folder)
 
 
 @pytest.mark.parametrize("year", [1971, 2106])
 def test_a_wrong_clock_changes_nothing(inputs: Inputs, reference: Reference, folder: Path, year: int):
     """Files from another year: complete entries are reused, damaged ones recomputed."""
-    reference.copy(folder, reference.alone)
+    reference.copy(folder, reference.single)
     shutil.rmtree(folder / "cache" / "poses")
     shutil.rmtree(folder / "cache" / "runs")
     (chunk, *_) = list((folder / "cache" / "crops").rglob("rgb/c/1/0/0/0"))
@@ -125,7 +125,7 @@ def test_a_wrong_clock_changes_nothing(inputs: Inputs, reference: Reference, fol
             break
         assert "run again" in ended.err
     assert ended.status == 0, ended.err
-    assert written(folder) == written(reference.alone)
+    assert read_results(folder) == read_results(reference.single)
 
 
 def test_entries_completed_in_the_future_are_not_old(reference: Reference, folder: Path, monkeypatch):

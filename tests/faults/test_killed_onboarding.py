@@ -51,8 +51,8 @@ def test_ten_kills_at_random_moments_change_no_byte(tmp_path):
     write_dataset(scene, objects=1, images=1, seed=2, size_hw=(120, 160), per_image=1, progress=False)
     start = time.monotonic()
     assert onboard(reference, scene).wait(300) == 0
-    whole, rng = chunks(reference), random.Random(7)
-    moments = sorted(rng.randrange(1, whole) for _ in range(KILLS))
+    expected, rng = chunks(reference), random.Random(7)
+    moments = sorted(rng.randrange(1, expected) for _ in range(KILLS))
     for moment in moments:
         process = onboard(disturbed, scene)
         while process.poll() is None and chunks(disturbed) < moment:

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers import STEPS, Inputs, Reference, stored, written
+from helpers import STEPS, Inputs, Reference, read_entries, read_results
 
 
 @pytest.mark.timeout(3000)
@@ -16,7 +16,7 @@ def test_a_killed_step_is_completed_by_the_next_run(
     inputs: Inputs, reference: Reference, folder: Path, step, kills, record_property
 ):
     rng = random.Random(f"{step} {kills}")
-    whole, results = stored(reference.after[step]), written(reference.after[step])
+    expected, results = read_entries(reference.after[step]), read_results(reference.after[step])
     killed = completed = late = 0
     lasts = reference.seconds[step]
     while killed < kills:
@@ -29,18 +29,18 @@ def test_a_killed_step_is_completed_by_the_next_run(
             killed += process.exitcode is None
             process.kill()
             process.join()
-            left = stored(folder)
-            assert all(whole[name] == value for name, value in left.items())
+            left = read_entries(folder)
+            assert all(expected[name] == value for name, value in left.items())
         start = time.monotonic()
         ended = inputs.run(folder, step)
         lasts = 0.5 * (lasts + time.monotonic() - start)  # follows the current load of the machine
         assert ended.status == 0, ended.err
-        assert stored(folder) == whole
-        assert written(folder) == results
+        assert read_entries(folder) == expected
+        assert read_results(folder) == results
         assert not list((folder / "cache").rglob("*.partial"))
         completed += 1
         shutil.rmtree(folder)
     record_property(
-        "told",
+        "summary",
         f"{step}: {killed} kills (and {late} that came too late), {completed} runs after them, all as the reference",
     )

@@ -108,7 +108,7 @@ def test_a_failure_of_any_request_is_reported_and_the_next_run_recovers(
         assert work(healthy) == EXPECTED
         assert not any(verify(healthy).values())
     failed = f"{len(range(1, requests + 1, every))} requests, each failed once"
-    record_property("told", f"{name}, {'lasting' if lasting else 'transient'}: {failed}, reported and recovered")
+    record_property("summary", f"{name}, {'lasting' if lasting else 'transient'}: {failed}, reported and recovered")
 
 
 def times_out(store: Store) -> bool:

@@ -4,7 +4,7 @@ import random
 from pathlib import Path
 
 import pytest
-from helpers import Inputs, Reference, stored, written
+from helpers import Inputs, Reference, read_entries, read_results
 
 
 @pytest.mark.timeout(3000)
@@ -16,7 +16,7 @@ def test_processes_on_one_cold_cache_write_the_same_bytes_as_one(
     inputs: Inputs, reference: Reference, folder: Path, count, killed, record_property
 ):
     folder.mkdir()
-    results = written(reference.alone)
+    results = read_results(reference.single)
     names = [f"process{n}" for n in range(count)]
     processes = [inputs.start(folder, "evaluate", f"out=out-{name}", name=name) for name in names]
     rng = random.Random(count)
@@ -27,8 +27,9 @@ def test_processes_on_one_cold_cache_write_the_same_bytes_as_one(
     for process, name in list(zip(processes, names, strict=True))[killed:]:
         ended = inputs.end(process, folder, name=name)
         assert ended.status == 0, ended.err
-        assert written(folder, f"out-{name}") == results
-    assert stored(folder) == stored(reference.alone)
+        assert read_results(folder, f"out-{name}") == results
+    assert read_entries(folder) == read_entries(reference.single)
     record_property(
-        "told", f"{count} processes on one cold cache, {killed} of them killed: {count - killed} ended as the reference"
+        "summary",
+        f"{count} processes on one cold cache, {killed} of them killed: {count - killed} ended as the reference",
     )
