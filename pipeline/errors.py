@@ -1,14 +1,14 @@
-"""What a user is told: one line that names the place, what was found and what is needed."""
+"""Errors shown to the user: one line that says where, what was found and what is needed."""
 
 from __future__ import annotations
 
 
 class DzopError(Exception):
-    """Anything a user can mend. Its text is one line; the command line prints it and exits with 1."""
+    """An error that the user can fix. Its text is one line; the command line prints it and exits with status 1."""
 
 
 class BadInput(DzopError):
-    """A file, a field or an option that cannot be used."""
+    """A file, field or option that cannot be used."""
 
     def __init__(self, where: object, *, found: object, needed: str) -> None:
         self.where, self.found, self.needed = _line(where), _line(found), _line(needed, 2000)
@@ -16,16 +16,16 @@ class BadInput(DzopError):
 
 
 def _line(value: object, length: int = 400) -> str:
-    """A value as part of one line, whatever a file made of it."""
+    """A value, which may come from a file, as part of one line: no line breaks or NUL bytes, at most ``length``."""
     text = str(value)[: length + 1]
     text = " ".join(text.splitlines()).replace("\0", "\\0")
     return text if len(text) <= length else f"{text[:length]}..."
 
 
 class NoPose(Exception):
-    """Raised inside the online route; route.py turns it into a NoEstimate, which is data, not a failure.
+    """Raised when a stage of the online route finds no pose; route.py turns it into a NoEstimate.
 
-    ``stage`` is the stage that gave up; ``reason`` says what it found and what it needs.
+    A missing pose is data, not a failure. ``reason`` says what the stage found and what it needs.
     """
 
     def __init__(self, stage: str, reason: str) -> None:

@@ -61,7 +61,7 @@ def test_weights_that_are_missing_are_told_with_the_field_that_sets_them_for_a_s
     ran = dzop(choice, *own, f"weights.{name}=./nowhere")
     (line,) = ran.err.strip().splitlines()
     assert line.startswith(f"error: {field}: found './nowhere'")
-    assert f"weights.{name}=FOLDER: for all methods" in line
+    assert f"weights.{name}=FOLDER sets it for all methods" in line
 
 
 def test_a_failure_is_forgotten_once_its_job_has_ended_well_with_other_weights(dzop, tmp_path):

@@ -1,1 +1,1 @@
-"""Files: reading and writing them, their digests, checkpoints of models, meshes."""
+"""Files: atomic writes, digests, model checkpoints and meshes."""

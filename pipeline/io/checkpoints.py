@@ -1,4 +1,4 @@
-"""Files of weights, whatever model they are of: found on disk or on a hub, listed, read. safetensors only."""
+"""Weight files of any model: located on disk or downloaded from a hub, listed and read. safetensors only."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ _offline: ContextVar[bool] = ContextVar("offline", default=False)
 
 
 def sweep_hint(name: str) -> str:
-    """How weights are named once for all methods, as sweeps want it."""
-    return f" (weights.{name}=FOLDER: for all methods)"
+    """Suffix for messages: the option that sets these weights for every method of a sweep."""
+    return f" (weights.{name}=FOLDER sets it for all methods)"
 
 
 class NotDownloaded(BadInput):
-    """Weights of a hub id that are not here, while nothing is to be fetched."""
+    """Weights of a hub id that are not in the local hub cache, inside ``offline()``."""
 
 
 @contextmanager
 def offline() -> Iterator[None]:
-    """Fetch nothing meanwhile: a plan spends nothing."""
-    before = _offline.set(True)
+    """Download nothing inside the block: a plan must cost nothing."""
+    token = _offline.set(True)
     try:
         yield
     finally:
-        _offline.reset(before)
+        _offline.reset(token)
 
 
 def is_local(weights: str) -> bool:
-    """True for what looks like a path: it exists, begins as a path does, or ends like a file of weights."""
+    """True for a path rather than a hub id: it exists, starts like a path, or has the suffix of a weight file."""
     return (
         weights.startswith(("/", "./", "../", "~"))
         or weights.endswith((".safetensors", *PICKLES))
@@ -44,35 +44,35 @@ def is_local(weights: str) -> bool:
 
 
 def fetch_snapshot(hub_id: str, revision: str | None, patterns: Sequence[str], *, field: str, name: str) -> Path:
-    """Local folder of the hub's files that match ``patterns``.
+    """Local folder with the hub's files that match ``patterns``, downloaded if necessary.
 
-    Raises BadInput naming ``field`` and what ``name`` is set by for all methods; NotDownloaded where ``offline`` rules.
+    Raises BadInput for ``field`` with the hint ``sweep_hint(name)``, and NotDownloaded inside ``offline()``.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
-    here = _offline.get()
+    local_only = _offline.get()
     try:
         folder = Path(
-            snapshot_download(hub_id, revision=revision, allow_patterns=list(patterns), local_files_only=here)
+            snapshot_download(hub_id, revision=revision, allow_patterns=list(patterns), local_files_only=local_only)
         )
-        if here and not any(folder.rglob("*.safetensors")):
-            raise LocalEntryNotFoundError("a part of the snapshot alone is here")
+        if local_only and not any(folder.rglob("*.safetensors")):
+            raise LocalEntryNotFoundError("only a part of the snapshot is in the local cache")
         return folder
     except LocalEntryNotFoundError as error:
-        if here:
-            found = f"{hub_id!r}, a hub id that was not fetched yet: its revision is not known offline"
-            raise NotDownloaded(field, found=found, needed="a run, which fetches it, or a local folder") from None
-        told = first_line(error)
+        if local_only:
+            found = f"{hub_id!r}, a hub id that is not downloaded yet: its revision is not known offline"
+            raise NotDownloaded(field, found=found, needed="a run, which downloads it, or a local folder") from None
+        reason = first_line(error)
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        told = first_line(error)
-    found = f"{hub_id!r}, which is no local path and was not fetched: {told.removeprefix('Got: ')}"
-    needed = "a reachable hub; or fetch it elsewhere (hf download) and give its local folder" + sweep_hint(name)
+        reason = first_line(error)
+    found = f"{hub_id!r}, which is not a local path and could not be downloaded: {reason.removeprefix('Got: ')}"
+    needed = "a reachable hub; or download it elsewhere (hf download) and give its local folder" + sweep_hint(name)
     raise BadInput(field, found=found, needed=needed)
 
 
 def list_shards(index: Path) -> list[Path]:
-    """The files that an index of sharded weights names. Raises BadInput."""
+    """Files named in the index of sharded weights, sorted. Raises BadInput."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict) or not weight_map:
         raise BadInput(index, found=f"weight_map {weight_map!r}", needed="the file of each tensor")
@@ -80,12 +80,12 @@ def list_shards(index: Path) -> list[Path]:
 
 
 def list_pickles(folder: Path) -> list[str]:
-    """Names of the files that would have to be unpickled."""
+    """Names of pickled weight files in a folder, sorted; these are never loaded."""
     return sorted(path.name for path in folder.glob("*") if path.suffix in PICKLES)
 
 
 def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes from a safetensors header. Raises BadInput for a file that is broken or cut off."""
+    """Shape of each tensor by name, from a safetensors header. Raises BadInput for a broken or truncated file."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -96,13 +96,13 @@ def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 def check_missing(names: Sequence[str], where: Path) -> None:
-    """Raises BadInput when weights are missing: diffusers and transformers would draw them at random."""
+    """Raise BadInput if ``names`` are missing: diffusers and transformers would initialise them at random."""
     if names:
         raise BadInput(where, found=f"no tensor for {names[0]} ({len(names)} missing)", needed="all weights")
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object. Raises BadInput."""
+    """A JSON file's object. Raises BadInput."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -113,6 +113,6 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error's text, for a BadInput."""
+    """First line of an error's text, at most 200 characters, for a BadInput."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0][:200]

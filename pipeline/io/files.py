@@ -28,7 +28,7 @@ def read_file(path: Path, needed: str) -> bytes:
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a file atomically through a temporary sibling file; missing parent folders are created.
 
-    A reader sees the old content or all of the new one. Raises DzopError when the disk is full or not writable.
+    A reader sees all of the old content or all of the new. Raises DzopError when the disk is full or read-only.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -39,10 +39,10 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
-        raise cannot_write(path, error) from None
+        raise write_error(path, error) from None
 
 
-def cannot_write(path: Path, error: OSError) -> DzopError:
+def write_error(path: Path, error: OSError) -> DzopError:
     """The error to raise when writing ``path`` failed: what went wrong and what to do."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DzopError(f"{path}: the disk is full; make room or write elsewhere, then run again")

@@ -414,5 +414,5 @@ def test_a_hub_id_out_of_reach_says_what_to_do(monkeypatch: pytest.MonkeyPatch, 
     for cls in (Dino, DinoV2):
         with pytest.raises(BadInput) as caught:
             cls().feature_shape(0)
-        assert str(caught.value).startswith(f"extract.weights: found '{cls().weights}', which is no local path")
+        assert str(caught.value).startswith(f"extract.weights: found '{cls().weights}', which is not a local path")
         assert "give its local folder" in str(caught.value)

@@ -143,11 +143,11 @@ def test_a_hub_id_out_of_reach_says_what_to_do(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     message = refusal("someone/no-such-model")
-    assert message.startswith("extract.weights: found 'someone/no-such-model', which is no local path")
+    assert message.startswith("extract.weights: found 'someone/no-such-model', which is not a local path")
     assert "give its local folder" in message
     assert "extract.weights: found 'no such/ id!'" in refusal("no such/ id!")
     monkeypatch.setattr("huggingface_hub.snapshot_download", _unreachable)
-    assert "was not fetched: ConnectError: no route, needs" in refusal("someone/no-such-model")
+    assert "could not be downloaded: ConnectError: no route, needs" in refusal("someone/no-such-model")
 
 
 def _unreachable(*args: object, **kwargs: object) -> None:
