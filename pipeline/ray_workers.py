@@ -220,7 +220,7 @@ class Worker:
         """Compute one item: its counts, and an error message that is empty on success."""
         assert self.graph is not None
         try:
-            return self.graph.do(task, item), ""
+            return self.graph.run_item(task, item), ""
         except DzopError as error:
             return {}, str(error)
 

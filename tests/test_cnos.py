@@ -234,7 +234,7 @@ def test_an_interrupted_run_goes_on_with_the_images_that_are_left(painted: Path,
     described = graph.detections.proposals
     assert described is not None
     first, *others = graph.context.image_ids
-    graph.do("proposals", first)
+    graph.run_item("proposals", first)
     CALLS.clear()
     graph_of(painted, tmp_path).detect()
     assert [call for call in CALLS if call.startswith("propose")] == [f"propose {im_id}" for _, im_id in others]

@@ -91,7 +91,7 @@ def test_a_stored_fit_is_the_fit_made_here_and_now(tmp_path):
     overrides = [o for o in SMALL if o.partition(".")[0] in ("render", "crop", "match")]
     chosen = stages("render=raycast", *overrides)
     graph = Graph(Context(chosen, dataset, dataset.targets, Store(MemoryStoreConfig()), Runtime(progress=False)))
-    graph.do("onboarding", 1)
+    graph.run_item("onboarding", 1)
     bank = graph.templates.bank(1)
     kept = bank.fitted(chosen.match.fit)
     assert set(kept) == {"mean", "axes", "words", "idf", "templates"}

@@ -1,12 +1,12 @@
-"""The cached graph: what every result is made from, and the only caller of the store.
+"""The cached graph: every intermediate result of a run, and the only code that reads and writes the store.
 
-A node is an entry of the store. Its key follows from digests of files and from specs alone, so it is known before
-anything is computed: a plan costs nothing, a step runs only what is missing, and a sweep over a matching parameter
-touches no template and no backbone.
+A node is an entry of the store. Its key follows from specs and from digests of files, so it is known before anything
+is computed: a plan costs nothing, a run computes only what is missing, and a sweep over a matching parameter renders
+and encodes nothing again.
 
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
-template features -> what is fitted to them, where a stage stands on it             templates.py
-image -> proposals -> crops -> features, for a detector that describes them         proposals.py
+template features -> fitted arrays, for stages that need them                       templates.py
+image -> proposals -> crops -> features, for detectors that describe proposals      proposals.py
 files, or features of proposals and templates -> detections                         detections.py
 image, detections -> query crops -> query features (by timestep and layer)          queries.py
 template features, query features, stages -> poses (by scene and object) -> run     poses.py
@@ -22,10 +22,11 @@ from typing import Any
 import torch
 
 from pipeline.errors import BadInput
-from pipeline.graph.checks import detection_warnings
+from pipeline.graph.checks import check_layers, detection_warnings
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
-from pipeline.graph.memory import Memory, fit_to_budgets, memory_of, need_of
+from pipeline.graph.memory import Memory, estimate_peak, fit_to_budgets
+from pipeline.graph.memory_needs import estimate_needs
 from pipeline.graph.plan import KEY_DIGITS, Node, Plan
 from pipeline.graph.plan_text import plan_costs, plan_table
 from pipeline.graph.poses import PoseNodes
@@ -35,7 +36,6 @@ from pipeline.graph.replay import Retraced, Retracer
 from pipeline.graph.scores import PoseEvaluation, ScoreNodes
 from pipeline.graph.tasks import Counts, Task, Workers, use_threads
 from pipeline.graph.templates import TemplateNodes
-from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.scoring import Scorer
@@ -68,24 +68,12 @@ class Graph:
         self.poses = PoseNodes(context, self.templates, self.queries)
 
     def check(self) -> None:
-        """Raise BadInput for a device, weights or a layer that are not there, before any work."""
-        self.context.runtime.torch_device()
-        _ = self.context.runtime.memory_bytes, self.context.runtime.vram_bytes
-        stages = self.context.stages
+        """Check device, budgets, weights and layers before anything is computed. Raises BadInput."""
+        runtime, stages = self.context.runtime, self.context.stages
+        runtime.torch_device()
+        _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for what is not a size
         stages.fuse.check(stages.extract.model)
-        asked = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
-        asked[stages.match.layer] = "match.layer"
-        for layer in stages.layers:
-            try:
-                stages.extract.feature_shape(layer)
-            except BadInput as fault:
-                if layer == SALIENCY_LAYER and "layer" in fault.where:
-                    found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
-                    raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
-                if "layer" in fault.where:
-                    needed = fault.needed.replace(f", {PSEUDO_LAYERS}", "")  # no maps: neither field takes them
-                    raise BadInput(asked[layer], found=fault.found, needed=needed) from None
-                raise
+        check_layers(stages)
         if self.detections.proposals:
             if where := self.context.dataset.location_field:
                 raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
@@ -93,12 +81,12 @@ class Graph:
         self.templates.views = fit_to_budgets(self.context, self.detections.proposals)
 
     def memory(self, *, passes: bool) -> tuple[Memory, Memory | None]:
-        """What the run will take at its peak: of the machine, and of the device where that is another.
+        """Estimated peak memory of the machine, and of the device if that is a GPU.
 
-        ``passes``: whether any image has to go through a backbone.
+        ``passes`` says whether any image has to pass through a backbone.
         """
-        need = need_of(self.context, self.detections.proposals)
-        return memory_of(self.context, need if passes else replace(need, weights=0, footprint=None))
+        needs = estimate_needs(self.context, self.detections.proposals)
+        return estimate_peak(self.context, needs if passes else replace(needs, weights=0, footprint=None))
 
     def limit_vram(self) -> None:
         """Limit torch's allocator, including the memory it caches, to ``runtime.max_vram``."""
@@ -107,52 +95,55 @@ class Graph:
             total = torch.cuda.get_device_properties(device).total_memory
             torch.cuda.set_per_process_memory_fraction(min(1.0, vram / total), device)
 
-    def onboard(self) -> None:
-        """Everything offline, for every object of the targets."""
-        kinds = [self.templates.onboarding]
-        if self.detections.proposals and not self.detections.known:
-            kinds.append(self.detections.proposals.describing)
-        with self.context.progress.bar(len(kinds) * len(self.context.object_ids), "onboarding", "object") as advance:
-            for task in kinds:
-                self.context.run_task(task, self.context.object_ids, advance)
+    # --- steps -------------------------------------------------------------------------------------------------------
 
-    def do(self, work: str, unit: Any) -> Counts:
-        """One unit of a kind of work, for whoever asks for it by name; returns what was computed for it."""
-        before: list[Task[Any]] = [self.templates.onboarding]
-        if self.detections.proposals:
-            before += [self.detections.proposals.describing, self.detections.proposals.proposing_all]
-        after: list[Task[Any]] = [self.queries.describing, self.poses.solving]
-        if work in [kind.name for kind in after]:
-            self.detect()
-        self.context.progress.counts.clear()
-        next(kind for kind in before + after if kind.name == work).do(unit, lambda rows: None)
-        return dict(self.context.progress.counts)
+    def onboard(self) -> None:
+        """Compute everything that needs no image, for every object of the targets."""
+        tasks = [self.templates.onboarding]
+        if self.detections.proposals and not self.detections.known:
+            tasks.append(self.detections.proposals.describe_task)
+        object_ids = self.context.object_ids
+        with self.context.progress.bar(len(tasks) * len(object_ids), "onboarding", "object") as advance:
+            for task in tasks:
+                self.context.run_task(task, object_ids, advance)
 
     def detect(self) -> list[Detection]:
-        """Detections of all targets, those that cannot be used included."""
+        """Detections of all targets, including those that cannot be used."""
         return self.detections.all
 
     def warnings(self) -> list[str]:
-        """What is odd about the detections, a line each."""
+        """Results of sanity checks on the detections, one line each."""
         return detection_warnings(self.context, self.detect())
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
-        self.detect()  # first: a fault in its files must not wait for hours of onboarding
+        # Read detections and meshes first: an error in their files must not appear after hours of onboarding.
+        self.detect()
         if not self.context.store.is_complete(self.poses.run_ref()):
             for obj_id in self.context.object_ids:
-                self.context.model(obj_id)  # nor must a mesh that does not fit its annotations
+                self.context.model(obj_id)
         self.onboard()
         return self.poses.estimate()
 
     def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
-        """The node of the poses' scores, and with them those of the correspondences they were solved from."""
-        retrace = self.retracer() if correspondences else None
-        return ScoreNodes(self.context, self.templates, self.poses, scorer, retrace)
+        """The node of the poses' scores, optionally with those of the correspondences they were solved from."""
+        retracer = self.retracer() if correspondences else None
+        return ScoreNodes(self.context, self.templates, self.poses, scorer, retracer)
 
     def retracer(self) -> Retracer:
-        """Shows how answers came about."""
+        """Recomputes how an answer came about, from stored features."""
         return Retracer(self.templates, self.queries, self.poses)
+
+    def run_item(self, task: str, item: Any) -> Counts:
+        """Run one item of the task with this name, in a worker; returns the counts of its steps."""
+        tasks: list[Task[Any]] = [self.templates.onboarding, self.queries.describing, self.poses.solving]
+        if self.detections.proposals:
+            tasks += [self.detections.proposals.describe_task, self.detections.proposals.propose_task]
+        if task in (self.queries.describing.name, self.poses.solving.name):
+            self.detect()  # not part of the item's counts
+        self.context.progress.counts.clear()
+        next(t for t in tasks if t.name == task).do(item, lambda steps: None)
+        return dict(self.context.progress.counts)
 
     def plan(self) -> Iterator[Node]:
         """Every node with its state, key, size and cost. Raises NotDownloaded at a key that missing weights decide."""

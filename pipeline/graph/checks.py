@@ -1,57 +1,95 @@
-"""Detections -> what is odd about them: no fault, and seldom meant. Said at the run's head and kept in its record."""
+"""Checks before a run: layers that an extractor lacks are errors, odd detections and cameras are warnings.
+
+Warnings are printed when a run starts and recorded in poses.json.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from pipeline.bop.masks import decode_rle
+from pipeline.errors import BadInput
 from pipeline.graph.context import Context, ImageId
+from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.views import Detection
+from pipeline.method import Stages
 
-FEW_PX = 16  # a mask of fewer pixels shows no shape
-WHOLE = 0.98  # of the image: a mask that leaves nothing out is often inverted, or drawn in the wrong colour
-HALF = 0.5  # of the image: one that also reaches all four sides is often the background
-OUTSIDE = 0.1  # of a box beyond the image: often two corners instead of a corner, width and height
+MIN_PIXELS = 16  # smaller masks show no shape
+FULL_SHARE = 0.98  # of the image: such a mask is often inverted, or its colours are
+HALF_SHARE = 0.5  # of the image: a mask this large that also touches all four sides is often the background
+OUTSIDE_SHARE = 0.1  # of a box outside the image: often two corners instead of corner, width and height
+
+
+def check_layers(stages: Stages) -> None:
+    """Raise BadInput, naming the field that asked for it, for a layer that the extractor does not have."""
+    field_of_layer = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
+    field_of_layer[stages.match.layer] = "match.layer"
+    for layer in stages.layers:
+        try:
+            stages.extract.feature_shape(layer)
+        except BadInput as error:
+            if "layer" not in error.where:
+                raise
+            if layer == SALIENCY_LAYER:
+                found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
+                raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
+            needed = error.needed.replace(f", {PSEUDO_LAYERS}", "")  # these fields take no pseudo-layers
+            raise BadInput(field_of_layer[layer], found=error.found, needed=needed) from None
 
 
 def detection_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
-    """One line for each detection that is odd, and for each camera whose poses nothing vouches for."""
-    found = []
+    """One line per suspicious camera, then one per suspicious detection.
+
+    Cameras are checked only without ground truth: annotated poses show that a camera is right.
+    """
+    warnings = []
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
-        if not context.dataset.has_ground_truth(scene_id) and (why := _camera_doubt(context, (scene_id, im_id))):
-            found.append(f"scene {scene_id}, image {im_id}: {why}")
+        annotated = context.dataset.has_ground_truth(scene_id)
+        if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
+            warnings.append(f"scene {scene_id}, image {im_id}: {problem}")
     for d in detections:
-        if d.defect is None and (why := _doubt(context, d)):
-            found.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {why}")
-    return found
+        if d.defect is None and (problem := _check_detection(context, d)):
+            warnings.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {problem}")
+    return warnings
 
 
-def _camera_doubt(context: Context, image: ImageId) -> str:
+def _check_camera(context: Context, image: ImageId) -> str:
     (h, w), (cx, cy) = context.dataset.image_size(*image), context.K(image)[:2, 2]
     if 0 <= cx <= w and 0 <= cy <= h:
         return ""
-    where = f"({cx:g}, {cy:g}) lies outside the image of {w} x {h} (width x height)"
-    return f"K's principal point {where}; is it the K of this image at this size?"
+    outside = f"({cx:g}, {cy:g}) lies outside the image of {w} x {h} (width x height)"
+    return f"K's principal point {outside}; is it the K of this image at this size?"
 
 
-def _doubt(context: Context, d: Detection) -> str:
+def _check_detection(context: Context, d: Detection) -> str:
+    return _check_box(context, d) if d.rle is None else _check_mask(context, d, d.rle)
+
+
+def _check_box(context: Context, d: Detection) -> str:
     h, w = context.dataset.image_size(d.scene_id, d.im_id)
-    round_all = False
-    if d.rle is None:
-        x0, y0, x1, y1 = np.clip(d.bbox_xyxy, -0.5, (w - 0.5, h - 0.5, w - 0.5, h - 0.5))
-        px, what = float(max(x1 - x0, 0) * max(y1 - y0, 0)), "box"
-        left, top, right, bottom = d.bbox_xyxy
-        if context.dataset.given_bbox_xyxy and px < (1 - OUTSIDE) * (right - left) * (bottom - top):
-            share = 1 - px / ((right - left) * (bottom - top))
-            return f"{share:.0%} of the box lies outside the image; is it x, y, width, height, and not two corners?"
-    else:
-        mask = decode_rle(d.rle)
-        px, what = float(mask.sum()), "mask"
-        round_all = all(side.any() for side in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
-    if px < FEW_PX:
-        return f"the {what} has {px:.0f} pixel{'s' if round(px) != 1 else ''}; a pose of so few says little"
-    if px >= WHOLE * h * w or (round_all and px >= HALF * h * w):
-        return f"the {what} covers {px / (h * w):.0%} of the image; is it the object's, and not inverted?"
+    x0, y0, x1, y1 = np.clip(d.bbox_xyxy, -0.5, (w - 0.5, h - 0.5, w - 0.5, h - 0.5))
+    left, top, right, bottom = d.bbox_xyxy
+    inside_px, box_px = float(max(x1 - x0, 0) * max(y1 - y0, 0)), (right - left) * (bottom - top)
+    if context.dataset.given_bbox_xyxy and inside_px < (1 - OUTSIDE_SHARE) * box_px:
+        share = 1 - inside_px / box_px
+        return f"{share:.0%} of the box lies outside the image; is it x, y, width, height, and not two corners?"
+    return _check_area("box", inside_px, h * w, is_background=False)
+
+
+def _check_mask(context: Context, d: Detection, rle: dict[str, Any]) -> str:
+    h, w = context.dataset.image_size(d.scene_id, d.im_id)
+    mask = decode_rle(rle)
+    touches_all_sides = all(side.any() for side in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+    pixels = float(mask.sum())
+    return _check_area("mask", pixels, h * w, is_background=touches_all_sides and pixels >= HALF_SHARE * h * w)
+
+
+def _check_area(what: str, pixels: float, image_pixels: int, *, is_background: bool) -> str:
+    if pixels < MIN_PIXELS:
+        return f"the {what} has {pixels:.0f} pixel{'s' if round(pixels) != 1 else ''}; too few for a reliable pose"
+    if pixels >= FULL_SHARE * image_pixels or is_background:
+        return f"the {what} covers {pixels / image_pixels:.0%} of the image; is it the object's, and not inverted?"
     return ""

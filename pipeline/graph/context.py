@@ -1,4 +1,4 @@
-"""What every node needs: stages, dataset, store, the backbone loaded once, and the two ways to fill entries."""
+"""What all nodes of a run share: stages, data, store and backbone; and how tasks are run and entries are filled."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
 from pipeline.store import Layout, Ref, Store, make_ref
 
-MESHES_BYTES = 256 << 20
+MESHES_BYTES = 256 << 20  # limit of meshes in memory
 
 ImageId = tuple[int, int]
 """(scene_id, im_id)"""
@@ -123,7 +123,7 @@ class Context:
     # --- entries of one kind -----------------------------------------------------------------------------------------
 
     def features(self, layer: int, inputs: Mapping[str, str]) -> Ref:
-        """Features of one layer of some crops, at a path a person can read."""
+        """Features of one layer of some crops, at a readable path."""
         extract = self.stages.extract
         recipe = {"kind": "features", "extract": extract.recipe(), "layer": layer}
         return make_ref(f"features/{extract.model}/t{extract.timestep}/layer{layer}", recipe, inputs)
@@ -187,9 +187,9 @@ class Context:
         self.fill(step, title, layouts, rows, self.runtime.batch or batch, compute, timing=timing)
 
     def maps(self, crops: Crops, layers: Sequence[int]) -> dict[int, np.ndarray]:
-        """Feature maps of crops as they are stored: float16, on the CPU."""
+        """Feature maps of crops by layer, float16 on the CPU, as they are stored."""
         maps = self.backbone(crops, layers)
-        return {layer: _half(maps[layer], layer) for layer in layers}
+        return {layer: _to_half(maps[layer], layer) for layer in layers}
 
 
 def stack_crops(crops: Sequence[Crop]) -> dict[str, np.ndarray]:
@@ -203,11 +203,10 @@ def _mesh_bytes(model: ObjectModel) -> int:
     return sum(array.nbytes for array in arrays if array is not None)
 
 
-def _half(maps: torch.Tensor, layer: int) -> np.ndarray:
-    """float16 on the CPU. Raises DzopError where a value does not fit: infinite features would give wrong poses."""
+def _to_half(maps: torch.Tensor, layer: int) -> np.ndarray:
+    """Convert to float16 on the CPU. Raises DzopError on overflow: infinite features would give wrong poses."""
     half = maps.half()
     if not torch.isfinite(half).all():
-        raise DzopError(
-            f"layer {layer}: features are not finite in float16; try extract.dtype=float32 or another layer"
-        )
+        needed = "try extract.dtype=float32 or another layer"
+        raise DzopError(f"layer {layer}: features are not finite in float16; {needed}")
     return half.cpu().numpy()

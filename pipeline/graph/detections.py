@@ -1,4 +1,4 @@
-"""targets -> detections, of files or of proposals that look like templates: one entry for all of them."""
+"""targets -> detections, read from files or made from proposals that look like templates. One entry per run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipeline.store import Ref, make_ref
 
 @dataclass(eq=False)
 class DetectionNodes:
-    """The entry of a run's detections. ``proposals``: what a detector that describes stands on, None for others."""
+    """The entry of a run's detections. ``proposals`` is None for detectors that read files."""
 
     context: Context
     proposals: ProposalNodes | None
@@ -28,59 +28,56 @@ class DetectionNodes:
         """All detections of the targets."""
         recipe = {"kind": "detections", "detect": self.context.stages.detect.recipe()}
         targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.context.targets]
-        return make_ref("detections", recipe, self._sources() | {"targets": self._asked(targets)})
-
-    def _asked(self, targets: list[list[int]]) -> str:
-        return digest([targets, None if self.proposals else self.context.dataset.given_bbox_xyxy])
+        given_box = None if self.proposals else self.context.dataset.given_bbox_xyxy
+        return make_ref("detections", recipe, self._sources() | {"targets": digest([targets, given_box])})
 
     def _sources(self) -> dict[str, str]:
-        """What decides the answer beside the targets."""
+        """Digests of what the detector reads: files, or features of proposals and templates."""
         detect, root = self.context.stages.detect, self.context.dataset.root
         if not isinstance(detect, DescribingDetector):
             files = detect.sources(self.context.dataset, self.context.targets)
             named = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
             return {"sources": files_digest(named)}
         assert self.proposals is not None
-        objects = {
-            f"object {obj_id}": self.proposals.template_features(obj_id).key for obj_id in self.context.object_ids
-        }
-        images = {f"image {s}/{i}": self.proposals.features((s, i)).key for s, i in self.context.image_ids}
+        proposals, context = self.proposals, self.context
+        objects = {f"object {obj_id}": proposals.template_features(obj_id).key for obj_id in context.object_ids}
+        images = {f"image {s}/{i}": proposals.features((s, i)).key for s, i in context.image_ids}
         return objects | images
 
     @property
     def known(self) -> bool:
-        """Whether they can be had without proposing or describing anything."""
+        """Whether the detections are available without computing proposals or features."""
         return self.proposals is None or self.context.store.is_complete(self.ref)
 
     @cached_property
     def all(self) -> list[Detection]:
-        """Detections of the targets, made once."""
-        fresh = not self.context.store.is_complete(self.ref)
-        if fresh:
-            found = self._find()
-            self.context.store.put_document(self.ref, [detection_to_record(d) for d in found], rows=len(found))
-        found = [detection_from_record(record) for record in self.context.store.read(self.ref).document]
-        self.context.progress.add("detections", **{"computed" if fresh else "reused": len(found)})
-        return found
+        """Detections of the targets, read from the store or computed."""
+        store, is_new = self.context.store, not self.context.store.is_complete(self.ref)
+        if is_new:
+            detections = self._detect()
+            store.put_document(self.ref, [detection_to_record(d) for d in detections], rows=len(detections))
+        detections = [detection_from_record(record) for record in store.read(self.ref).document]
+        self.context.progress.add("detections", **{"computed" if is_new else "reused": len(detections)})
+        return detections
 
     def identity(self, detection: Detection) -> dict[str, Any]:
-        """What poses depend on: seconds that were measured here, other in every run, are no part of it."""
+        """The part of a detection that poses depend on: without seconds measured here, which differ in every run."""
         record = detection_to_record(detection)
         return record | {"time_s": 0.0} if self.proposals else record
 
-    def _find(self) -> list[Detection]:
-        detect = self.context.stages.detect
+    def _detect(self) -> list[Detection]:
+        context, detect, proposals = self.context, self.context.stages.detect, self.proposals
         if not isinstance(detect, DescribingDetector):
-            return detect(self.context.dataset, self.context.targets)
-        assert self.proposals is not None
-        with self.context.progress.bar(len(self.context.object_ids), "descriptions", "object") as advance:
-            self.context.run_task(self.proposals.describing, self.context.object_ids, advance)
-        templates = {obj_id: self.proposals.template_descriptors(obj_id) for obj_id in self.context.object_ids}
-        found: list[Detection] = []
-        with self.context.progress.bar(len(self.context.image_ids), "proposals", "image") as advance:
-            self.context.run_task(self.proposals.proposing_all, self.context.image_ids, advance)
-        for image in self.context.image_ids:
-            targets = [t for t in self.context.targets if (t.scene_id, t.im_id) == image]
-            described = self.proposals.described(image)
-            found += detect.by_description(targets, *described, templates, self.proposals.time_s(image))
-        return found
+            return detect(context.dataset, context.targets)
+        assert proposals is not None
+        with context.progress.bar(len(context.object_ids), "descriptions", "object") as advance:
+            context.run_task(proposals.describe_task, context.object_ids, advance)
+        with context.progress.bar(len(context.image_ids), "proposals", "image") as advance:
+            context.run_task(proposals.propose_task, context.image_ids, advance)
+        templates = {obj_id: proposals.template_descriptors(obj_id) for obj_id in context.object_ids}
+        detections: list[Detection] = []
+        for image in context.image_ids:
+            targets = [t for t in context.targets if (t.scene_id, t.im_id) == image]
+            described = proposals.read_described(image)
+            detections += detect.by_description(targets, *described, templates, proposals.time_s(image))
+        return detections

@@ -1,4 +1,4 @@
-"""Every node of a run with its state, key, size and cost, before anything is spent."""
+"""Nodes of a run with their state, key, size and cost, without computing anything."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from pipeline.io.checkpoints import NotDownloaded
 from pipeline.store import Layout, Ref
 
 KEY_DIGITS = 12  # of a key, in tables and in names of folders
-TEMPLATE_PIXEL_BYTES = 7  # rgb and float32 depth, before compression
+TEMPLATE_PIXEL_BYTES = 7  # uint8 rgb and float32 depth, before compression
 
 
 @dataclass(frozen=True)
 class Node:
-    """One entry as a plan shows it. ``cost``: views to render, images to pass through the backbone, poses to solve.
+    """One entry as a plan shows it. ``cost`` says what computing it takes; "" for a cached entry.
 
-    Of what is not cached: ``passes``, images through the backbone, counted once for all layers of one pass, and
-    ``seconds`` as measured before, None where they are not known. ``sized``: whether ``nbytes`` is known beforehand.
+    For a missing entry, ``passes`` counts images through the backbone (once for all layers of one pass) and
+    ``seconds`` estimates its time, None if unknown. ``sized`` is False if ``nbytes`` is unknown before it is computed.
     """
 
     step: str
@@ -40,8 +40,10 @@ class Node:
 
 @dataclass(eq=False)
 class Plan:
-    """Lists nodes. Detections alone are made, since the keys of all that follows depend on them; where they would
-    have to be computed the list ends with them.
+    """Lists the nodes of a run.
+
+    All keys after the detections depend on them. Detections that come from files are read; if they would have to be
+    computed, the list ends with them.
     """
 
     context: Context
@@ -51,92 +53,94 @@ class Plan:
     detections: DetectionNodes
 
     def nodes(self) -> Iterator[Node]:
-        """All nodes in the order of the route. Raises NotDownloaded at the first whose key weights decide."""
-        unknown: NotDownloaded | None = None
+        """All nodes in the order of the route. Raises NotDownloaded after the nodes that need no missing weights."""
+        not_downloaded: NotDownloaded | None = None
         for obj_id in self.context.object_ids:
-            yield from self._views_of_object(obj_id)
+            yield from self._view_nodes(obj_id)
             try:
-                yield from self._features_of_object(obj_id)
-            except NotDownloaded as fault:
-                unknown = fault
-        if unknown is not None:
-            raise unknown
+                yield from self._template_feature_nodes(obj_id)
+            except NotDownloaded as error:
+                not_downloaded = error
+        if not_downloaded is not None:
+            raise not_downloaded
         if self.detections.proposals:
-            yield from self._of_proposals(self.detections.proposals)
+            yield from self._proposal_nodes(self.detections.proposals)
         if not self.detections.known:
             return
         for image in self.context.image_ids:
-            yield from self._of_image(image)
-        for group, targets in self.poses.groups.items():
-            of, n = f"scene {group[0]} object {group[1]}", len(targets)
-            work = timing_key("poses", self.context.stages, rows=self._views(group[1]))
-            passes = n * self.context.stages.second_look
-            yield self._node("poses", of, self.poses.poses(group), None, f"{n} targets", work, n, passes)
+            yield from self._query_nodes(image)
+        yield from self._pose_nodes()
 
-    def _views(self, obj_id: int) -> int:
-        return len(self.context.stages.render.cameras(self.context.model(obj_id).mesh)[1])
+    def _view_nodes(self, obj_id: int) -> Iterator[Node]:
+        stages = self.context.stages
+        _, T_cam_obj, (h, w) = stages.render.cameras(self.context.model(obj_id).mesh)
+        n, of = len(T_cam_obj), f"object {obj_id}"
+        nbytes = n * (h * w * TEMPLATE_PIXEL_BYTES + T_cam_obj[0].nbytes)
+        timing = timing_key("templates", stages)
+        yield self._node("templates", of, self.templates.templates(obj_id), nbytes, f"{n} views", timing, n)
+        nbytes, timing = _total_bytes(self.context.crops_layout(), n), timing_key("template crops", stages)
+        yield self._node("template crops", of, self.templates.crops(obj_id), nbytes, f"{n} crops", timing, n)
 
-    def _views_of_object(self, obj_id: int) -> Iterator[Node]:
-        _, T_cam_obj, (h, w) = self.context.stages.render.cameras(self.context.model(obj_id).mesh)
-        n, of, stages = len(T_cam_obj), f"object {obj_id}", self.context.stages
-        size = n * (h * w * TEMPLATE_PIXEL_BYTES + T_cam_obj[0].nbytes)
-        ref, crops = self.templates.templates(obj_id), self.templates.crops(obj_id)
-        yield self._node("templates", of, ref, size, f"{n} views", timing_key("templates", stages), n)
-        size, work = _size(self.context.crops_layout(), n), timing_key("template crops", stages)
-        yield self._node("template crops", of, crops, size, f"{n} crops", work, n)
-
-    def _features_of_object(self, obj_id: int) -> Iterator[Node]:
-        n, of, stages = self._views(obj_id), f"object {obj_id}", self.context.stages
+    def _template_feature_nodes(self, obj_id: int) -> Iterator[Node]:
+        n, of, stages = self._count_views(obj_id), f"object {obj_id}", self.context.stages
         refs = {layer: self.templates.features(obj_id, layer) for layer in stages.layers}
-        yield from self._features("template features", of, refs, n)
-        missing = [fit for fit in stages.fits if not self.context.store.is_complete(self.templates.fitted(obj_id, fit))]
-        for fit in stages.fits:
-            size = fit.array_bytes(stages.extract.feature_shape(fit.layer)[0], n)
-            share = 1 / len(missing) if missing else 0
-            ref, work = self.templates.fitted(obj_id, fit), timing_key("fits", stages)
-            yield self._node("fits", f"{of} {fit.kind}", ref, size, f"{n} templates", work, share)
+        yield from self._feature_nodes("template features", of, refs, n)
+        refs_of_fits = {fit: self.templates.fitted(obj_id, fit) for fit in stages.fits}
+        missing = [fit for fit, ref in refs_of_fits.items() if not self.context.store.is_complete(ref)]
+        share = 1 / len(missing) if missing else 0  # what was timed is all fits of an object together
+        for fit, ref in refs_of_fits.items():
+            nbytes = fit.array_bytes(stages.extract.feature_shape(fit.layer)[0], n)
+            timing = timing_key("fits", stages)
+            yield self._node("fits", f"{of} {fit.kind}", ref, nbytes, f"{n} templates", timing, share)
 
-    def _of_image(self, image: ImageId) -> Iterator[Node]:
-        n, of = len(self.queries.of_image[image]), f"scene {image[0]} image {image[1]}"
-        size, work = _size(self.context.crops_layout(), n), timing_key("query crops", self.context.stages)
-        yield self._node("query crops", of, self.queries.crops(image), size, f"{n} crops", work, n)
-        if n:
-            refs = {layer: self.queries.features(image, layer) for layer in self.context.stages.layers}
-            yield from self._features("query features", of, refs, n)
-
-    def _of_description(self, described: ProposalNodes, obj_id: int) -> Iterator[Node]:
-        n, layer = self._views(obj_id), described.detector.describe_layer
-        refs = {layer: described.template_features(obj_id)}
-        nodes = self._features("template features", f"object {obj_id}, to be detected by", refs, n, described.context)
-        own = {self.templates.features(obj_id, layer) for layer in self.context.stages.layers}
-        return (node for node in nodes if node.ref not in own)
-
-    def _of_proposals(self, described: ProposalNodes) -> Iterator[Node]:
-        """What detections are computed from, and they themselves."""
+    def _proposal_nodes(self, proposals: ProposalNodes) -> Iterator[Node]:
+        """The detections and what they are computed from."""
         for obj_id in self.context.object_ids:
-            yield from self._of_description(described, obj_id)
+            yield from self._described_template_nodes(proposals, obj_id)
         for image in self.context.image_ids:
             of = f"scene {image[0]} image {image[1]}"
-            ref = described.proposals(image)
-            yield self._node("proposals", of, ref, None, "1 image through the proposer")
-            ref = described.features(image)
-            yield self._node("proposal features", of, ref, None, "its proposals through the backbone")
-        follows = "query crops, query features, poses and scores follow from them and are not listed"
-        yield self._node("detections", f"{len(self.context.targets)} targets", self.detections.ref, None, follows)
+            yield self._node("proposals", of, proposals.proposals(image), None, "1 image through the proposer")
+            cost = "its proposals through the backbone"
+            yield self._node("proposal features", of, proposals.features(image), None, cost)
+        cost = "query crops, query features, poses and scores depend on them and are not listed"
+        yield self._node("detections", f"{len(self.context.targets)} targets", self.detections.ref, None, cost)
 
-    def _features(
+    def _described_template_nodes(self, proposals: ProposalNodes, obj_id: int) -> Iterator[Node]:
+        n, layer = self._count_views(obj_id), proposals.detector.describe_layer
+        refs = {layer: proposals.template_features(obj_id)}
+        of = f"object {obj_id}, for the detector"
+        nodes = self._feature_nodes("template features", of, refs, n, proposals.context)
+        listed = {self.templates.features(obj_id, layer) for layer in self.context.stages.layers}
+        return (node for node in nodes if node.ref not in listed)
+
+    def _query_nodes(self, image: ImageId) -> Iterator[Node]:
+        n, of, stages = len(self.queries.of_image[image]), f"scene {image[0]} image {image[1]}", self.context.stages
+        nbytes, timing = _total_bytes(self.context.crops_layout(), n), timing_key("query crops", stages)
+        yield self._node("query crops", of, self.queries.crops(image), nbytes, f"{n} crops", timing, n)
+        if n:
+            refs = {layer: self.queries.features(image, layer) for layer in stages.layers}
+            yield from self._feature_nodes("query features", of, refs, n)
+
+    def _pose_nodes(self) -> Iterator[Node]:
+        for (scene_id, obj_id), targets in self.poses.groups.items():
+            n, of, stages = len(targets), f"scene {scene_id} object {obj_id}", self.context.stages
+            timing = timing_key("poses", stages, rows=self._count_views(obj_id))
+            ref, passes = self.poses.poses((scene_id, obj_id)), n * stages.second_look
+            yield self._node("poses", of, ref, None, f"{n} targets", timing, n, passes)
+
+    def _feature_nodes(
         self, step: str, of: str, refs: Mapping[int, Ref], rows: int, context: Context | None = None
     ) -> Iterator[Node]:
-        """A node for every layer; those that are missing come of one pass, which the first of them pays for."""
+        """A node per layer. One pass computes all missing layers; its cost counts for the first of them."""
         context = context or self.context
         missing = [layer for layer, ref in refs.items() if not context.store.is_complete(ref)]
-        work = timing_key("features", context.stages, missing) if missing else ""
+        timing = timing_key("features", context.stages, missing) if missing else ""
         for layer, ref in refs.items():
-            pays = rows if layer in missing[:1] else 0
-            size, cost = _size(context.features_layout(layer), rows), f"{rows} images through the backbone"
-            yield self._node(
-                step, f"{of} layer {layer}" if context is self.context else of, ref, size, cost, work, pays, pays
-            )
+            passes = rows if layer in missing[:1] else 0
+            name = f"{of} layer {layer}" if context is self.context else of
+            nbytes = _total_bytes(context.features_layout(layer), rows)
+            cost = f"{rows} images through the backbone"
+            yield self._node(step, name, ref, nbytes, cost, timing, passes, passes)
 
     def _node(
         self,
@@ -145,18 +149,21 @@ class Plan:
         ref: Ref,
         nbytes: int | None,
         cost: str,
-        work: str = "",
+        timing: str = "",
         rows: float = 1,
         passes: int = 0,
     ) -> Node:
-        """``nbytes`` None: not known beforehand; ``work`` "": seconds nobody measures."""
+        """A node with its state. ``nbytes`` None: unknown beforehand; ``timing`` "": its seconds are not measured."""
         stored = self.context.store.size(ref)
         if stored is not None:
             return Node(step, of, ref, "cached", stored, "")
-        seconds = self.context.timings.seconds(work, rows) if work and rows else (0.0 if not rows else None)
+        seconds = self.context.timings.seconds(timing, rows) if timing and rows else (0.0 if not rows else None)
         state = self.context.store.state(ref)
         return Node(step, of, ref, state, nbytes or 0, cost, passes, seconds, nbytes is not None)
 
+    def _count_views(self, obj_id: int) -> int:
+        return len(self.context.stages.render.cameras(self.context.model(obj_id).mesh)[1])
 
-def _size(layouts: Mapping[str, Layout], rows: int) -> int:
+
+def _total_bytes(layouts: Mapping[str, Layout], rows: int) -> int:
     return sum(layout.nbytes(rows) for layout in layouts.values())

@@ -1,11 +1,11 @@
-"""image -> proposals -> crops -> features, and the descriptors of them and of templates that detections come of."""
+"""image -> proposals -> crops -> features, and descriptors of proposals and templates, which detectors compare."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import cast
 
 import torch
@@ -29,51 +29,52 @@ from pipeline.store import Ref, make_ref
 
 @dataclass(eq=False)
 class ProposalNodes:
-    """Entries that a describing detector stands on. Methods without a verb name entries.
+    """Entries that a describing detector reads. Methods without a verb name entries.
 
-    ``context`` has the detector's extractor in the place of the route's: templates and their crops are the route's own
-    entries, and so are their features where the two extractors are one.
+    ``context`` has the detector's extractor instead of the route's. Templates and their crops are the same entries as
+    the route's, and so are their features if both use the same extractor.
     """
 
     context: Context
     detector: DescribingDetector
+    _proposal_refs: dict[ImageId, Ref] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def templates(self) -> TemplateNodes:
-        """Entries of objects under the detector's extractor."""
+        """Entries of objects with the detector's extractor."""
         return TemplateNodes(self.context)
 
     @cached_property
-    def proposing(self) -> LoadedProposer:
-        """The proposer with its weights, loaded when the first image lacks its proposals."""
+    def proposer(self) -> LoadedProposer:
+        """The proposer with its weights, loaded when the first image lacks proposals."""
         return self.detector.proposals.load(self.context.runtime)
 
     def check(self) -> None:
-        """Raise BadInput for weights or a layer that are not there, and for a descriptor that sees the truth."""
+        """Raise BadInput for missing weights, a missing layer, and an extractor that needs the true pose."""
         extract, layer = self.context.stages.extract, self.detector.describe_layer
         if extract.needs_geometry:
             raise BadInput("detect.describe", found=f"{extract.kind}, an oracle", needed="an extractor of photographs")
         try:
             extract.feature_shape(layer)
-        except BadInput as fault:
-            if "layer" not in fault.where:
+        except BadInput as error:
+            if "layer" not in error.where:
                 raise
-            needed = f"{fault.needed}; or an extractor that has it (extract@detect.describe=NAME)"
-            raise BadInput("detect.describe_layer", found=fault.found, needed=needed) from None
-        self.detector.proposals.recipe()
+            needed = f"{error.needed}; or an extractor that has it (extract@detect.describe=NAME)"
+            raise BadInput("detect.describe_layer", found=error.found, needed=needed) from None
+        self.detector.proposals.recipe()  # looks for the weights
 
     # --- objects ---------------------------------------------------------------------------------------------------
 
     def template_features(self, obj_id: int) -> Ref:
-        """Features of an object's templates that descriptors are read from."""
+        """Features of an object's templates from which their descriptors are pooled."""
         return self.templates.features(obj_id, self.detector.describe_layer)
 
     @cached_property
-    def describing(self) -> Task[int]:
-        """Rendering, cropping and describing templates, by object."""
-        return Task("descriptions", self._describe, lambda obj_id: self._complete(self.template_features(obj_id)))
+    def describe_task(self) -> Task[int]:
+        """Render, crop and encode templates, by object."""
+        return Task("descriptions", self._describe, lambda obj_id: self._is_complete(self.template_features(obj_id)))
 
-    def _complete(self, ref: Ref) -> bool:
+    def _is_complete(self, ref: Ref) -> bool:
         return self.context.store.is_complete(ref)
 
     def _describe(self, obj_id: int, advance: Advance) -> None:
@@ -83,22 +84,21 @@ class ProposalNodes:
         advance(1)
 
     def template_descriptors(self, obj_id: int) -> Float[torch.Tensor, "n c"]:
-        """One vector for each of an object's templates."""
-        return self._descriptors(self.templates.crops(obj_id), self.template_features(obj_id))
+        """One descriptor for each of an object's templates."""
+        return self._read_descriptors(self.templates.crops(obj_id), self.template_features(obj_id))
 
     # --- images ----------------------------------------------------------------------------------------------------
 
-    @cached_property
-    def proposals(self) -> Callable[[ImageId], Ref]:
+    def proposals(self, image: ImageId) -> Ref:
         """Proposals of an image."""
-        return lru_cache(maxsize=None)(self._proposals)
-
-    def _proposals(self, image: ImageId) -> Ref:
-        recipe = {"kind": "proposals", "proposals": self.detector.proposals.recipe()}
-        return make_ref("proposals", recipe, {"image": file_digest(self.context.dataset.image_path(*image))})
+        if image not in self._proposal_refs:
+            recipe = {"kind": "proposals", "proposals": self.detector.proposals.recipe()}
+            inputs = {"image": file_digest(self.context.dataset.image_path(*image))}
+            self._proposal_refs[image] = make_ref("proposals", recipe, inputs)
+        return self._proposal_refs[image]
 
     def crops(self, image: ImageId) -> Ref:
-        """Their crops."""
+        """Crops of an image's proposals."""
         recipe = {"kind": "proposal crops", "crop": self.context.stages.crop.recipe()}
         inputs = {"proposals": self.proposals(image).key}
         if self.context.stages.crop.needs_camera:
@@ -106,61 +106,63 @@ class ProposalNodes:
         return make_ref("crops", recipe, inputs)
 
     def features(self, image: ImageId) -> Ref:
-        """Features of these that descriptors are read from; none for an image without a crop."""
+        """Features of these crops; an image without crops has no such entry."""
         return self.context.features(self.detector.describe_layer, {"crops": self.crops(image).key})
 
     @cached_property
-    def proposing_all(self) -> Task[ImageId]:
-        """Proposing, cropping and describing, by image."""
-        return Task("proposals", self._make, self._made)
+    def propose_task(self) -> Task[ImageId]:
+        """Propose, crop and encode, by image."""
+        return Task("proposals", self._make, self._is_made)
 
-    def _made(self, image: ImageId) -> bool:
-        if not (self._complete(self.proposals(image)) and self._complete(self.crops(image))):
+    def _is_made(self, image: ImageId) -> bool:
+        if not (self._is_complete(self.proposals(image)) and self._is_complete(self.crops(image))):
             return False
-        return not self.context.store.read(self.crops(image)).rows or self._complete(self.features(image))
+        return not self.context.store.read(self.crops(image)).rows or self._is_complete(self.features(image))
 
     def _make(self, image: ImageId, advance: Advance) -> None:
         rows = self._make_crops(image, self._make_proposals(image))
         if rows:
             refs = {self.detector.describe_layer: self.features(image)}
-            self.context.extract("proposal features", "", refs, rows, lambda some: self._crops_of(image, some))
+            self.context.extract("proposal features", "", refs, rows, lambda batch: self._read_crops(image, batch))
         advance(1)
 
-    def described(self, image: ImageId) -> tuple[list[Proposal], Float[torch.Tensor, "p c"]]:
-        """An image's proposals that have a crop, and one vector for each."""
+    def read_described(self, image: ImageId) -> tuple[list[Proposal], Float[torch.Tensor, "p c"]]:
+        """The p proposals of an image that have a crop, and their descriptors."""
         kept = self.context.store.read(self.crops(image)).document["kept"]
-        proposals = [proposal_from_record(record) for record in self.context.store.read(self.proposals(image)).document]
+        records = self.context.store.read(self.proposals(image)).document
         if not kept:
             channels = self.context.stages.extract.feature_shape(self.detector.describe_layer)[0]
             return [], torch.zeros((0, channels), device=self.context.device)
-        return [proposals[i] for i in kept], self._descriptors(self.crops(image), self.features(image))
+        proposals = [proposal_from_record(records[position]) for position in kept]
+        return proposals, self._read_descriptors(self.crops(image), self.features(image))
 
     def time_s(self, image: ImageId) -> float:
-        """Seconds that an image's proposals and their features took."""
-        crops = self.context.store.read(self.crops(image))
-        features = self.context.store.read(self.features(image)).time_s if crops.rows else 0.0
-        return self.context.store.read(self.proposals(image)).time_s + crops.time_s + features
+        """Seconds that an image's proposals, crops and features took."""
+        read = self.context.store.read
+        crops = read(self.crops(image))
+        features_s = read(self.features(image)).time_s if crops.rows else 0.0
+        return read(self.proposals(image)).time_s + crops.time_s + features_s
 
     def _make_proposals(self, image: ImageId) -> list[Proposal]:
-        ref = self.proposals(image)
-        fresh = not self.context.store.is_complete(ref)
-        if fresh:
-            propose = self.proposing  # loading its weights is no part of an image's seconds
+        ref, store = self.proposals(image), self.context.store
+        is_new = not store.is_complete(ref)
+        if is_new:
+            propose = self.proposer  # loads the weights now, so that the seconds below do not include it
             start = time.perf_counter()
-            found = propose(self.context.dataset.image(*image))
+            proposals = propose(self.context.dataset.image(*image))
             seconds = time.perf_counter() - start
-            records = [proposal_to_record(proposal) for proposal in found]
-            self.context.store.put_document(ref, records, rows=len(found), time_s=seconds)
-        entry = self.context.store.read(ref)
-        counted = {"computed" if fresh else "reused": entry.rows}
-        self.context.progress.add("proposals", **counted, time_s=entry.time_s if fresh else 0.0)
+            records = [proposal_to_record(proposal) for proposal in proposals]
+            store.put_document(ref, records, rows=len(records), time_s=seconds)
+        entry = store.read(ref)
+        counts = {"computed" if is_new else "reused": entry.rows}
+        self.context.progress.add("proposals", **counts, time_s=entry.time_s if is_new else 0.0)
         return [proposal_from_record(record) for record in entry.document]
 
     def _make_crops(self, image: ImageId, proposals: Sequence[Proposal]) -> int:
         """Crop an image's proposals; returns how many could be cropped."""
-        ref = self.crops(image)
-        if self.context.store.is_complete(ref):
-            return self.context.store.read(ref).rows
+        ref, store = self.crops(image), self.context.store
+        if store.is_complete(ref):
+            return store.read(ref).rows
         start = time.perf_counter()
         photo = self.context.dataset.image(*image)
         crops, kept = [], []
@@ -169,12 +171,12 @@ class ProposalNodes:
                 crops.append(self.context.stages.crop(photo.rgb, decode_rle(proposal.rle), proposal.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose:
-                continue  # it cannot be an object that a pose could be found of
+                continue  # what cannot be cropped cannot be matched either
         if not crops:
-            self.context.store.put_document(ref, {"kept": []}, rows=0, time_s=time.perf_counter() - start)
+            store.put_document(ref, {"kept": []}, rows=0, time_s=time.perf_counter() - start)
             return 0
         arrays = stack_crops(crops)
-        self.context.store.fill(
+        store.fill(
             {ref: self.context.crops_layout()},
             rows=len(crops),
             batch=len(crops),
@@ -183,23 +185,23 @@ class ProposalNodes:
         )
         return len(crops)
 
-    def _crops_of(self, image: ImageId, rows: Sequence[int]) -> Crops:
+    def _read_crops(self, image: ImageId, rows: Sequence[int]) -> Crops:
         entry = self.context.store.read(self.crops(image))
         return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows))
 
-    def _descriptors(self, crops: Ref, features: Ref) -> Float[torch.Tensor, "n c"]:
+    def _read_descriptors(self, crops: Ref, features: Ref) -> Float[torch.Tensor, "n c"]:
         maps = self.context.tensor(self.context.store.read(features).array("maps"))
         return pool_foreground(maps, self.context.tensor(self.context.store.read(crops).array("mask")))
 
 
 def proposal_nodes(context: Context) -> ProposalNodes | None:
-    """Nodes of the run's detector where it is one that describes."""
+    """Nodes of the run's detector; None for a detector that does not describe proposals."""
     detector = context.stages.detect
     if not isinstance(detector, DescribingDetector):
         return None
     extract = cast(Extractor, detector.describe)
     if extract == context.stages.extract:
-        return ProposalNodes(context, detector)  # one backbone in memory
-    describing = replace(context, stages=replace(context.stages, extract=extract))
-    describing.models = context.models  # meshes are read once
-    return ProposalNodes(describing, detector)
+        return ProposalNodes(context, detector)  # shares the loaded backbone
+    own_context = replace(context, stages=replace(context.stages, extract=extract))
+    own_context.models = context.models  # shares the meshes
+    return ProposalNodes(own_context, detector)

@@ -1,4 +1,4 @@
-"""poses, ground truth -> scores of a run: one entry, made once for every set of poses."""
+"""poses, ground truth -> scores. One entry per run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.bop.results import ResultRow
 from pipeline.graph.context import Context
@@ -18,6 +19,7 @@ from pipeline.graph.poses import PoseNodes
 from pipeline.graph.replay import Retracer
 from pipeline.graph.templates import TemplateNodes
 from pipeline.io.digests import files_digest
+from pipeline.items.online import Hypothesis
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.scores import (
@@ -40,9 +42,10 @@ Instance = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class PoseEvaluation:
-    """A run's answers scored against the ground truth. ``by_answer[i]``: errors of answer i, None without an instance.
+    """A run's answers scored against the ground truth.
 
-    ``correspondences``: median error of an instance's correspondences over its diameter, where they were asked for.
+    ``by_answer[i]``: errors of answer i, None without a pose or an instance. ``templates``: angles between the matched
+    template and the true view. ``correspondences``: median error over the diameter, if it was asked for.
     """
 
     scored: ScoringResult
@@ -53,23 +56,20 @@ class PoseEvaluation:
 
 @dataclass(eq=False)
 class ScoreNodes:
-    """The entry of a run's scores. ``scorer`` says what poses are held against; ``retrace`` shows correspondences.
-
-    Without ``retrace`` they are not looked at.
-    """
+    """The entry of a run's scores. ``retracer`` recomputes correspondences; None leaves them out of the scores."""
 
     context: Context
     templates: TemplateNodes
     poses: PoseNodes
     scorer: Scorer
-    retrace: Retracer | None = None
+    retracer: Retracer | None = None
 
     @cached_property
     def ref(self) -> Ref:
         """Scores of the run's poses."""
         scorer, data = self.scorer, self.context.dataset
         recipe = {"kind": "scores", "version": SCORES_VERSION, "vsd_delta_mm": scorer.vsd_delta_mm}
-        recipe |= {"correspondences": True} if self.retrace else {}
+        recipe |= {"correspondences": True} if self.retracer else {}
         depth = "" if scorer.no_vsd else files_digest({str(image): data.depth_path(*image) for image in scorer.images})
         meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.context.object_ids}
         info = data.model_path(0, folder=scorer.models).with_name("models_info.json")
@@ -80,89 +80,103 @@ class ScoreNodes:
 
     def node(self) -> Node:
         """The entry as a plan shows it."""
-        state, targets = self.context.store.state(self.ref), len(self.context.targets)
-        cost = "" if state == "cached" else f"{targets} targets to hold against ground truth"
-        size, seconds = self.context.store.size(self.ref), self.context.timings.seconds(self._work, targets)
+        store, targets = self.context.store, len(self.context.targets)
+        state, size, of = store.state(self.ref), store.size(self.ref), f"{targets} targets"
+        cost = "" if state == "cached" else f"{targets} targets to score against ground truth"
         if size is not None:
-            return Node("scores", f"{targets} targets", self.ref, state, size, cost)
-        return Node("scores", f"{targets} targets", self.ref, state, 0, cost, seconds=seconds, sized=False)
+            return Node("scores", of, self.ref, state, size, cost)
+        seconds = self.context.timings.seconds(self._timing_key, targets)
+        return Node("scores", of, self.ref, state, 0, cost, seconds=seconds, sized=False)
 
     @property
-    def _work(self) -> str:
-        """What decides the seconds of a target."""
-        how = [self.scorer.vsd_delta_mm, not self.scorer.no_vsd, self.retrace is not None, self.scorer.models]
-        return digest(["scores", self.context.dataset.name, how])
+    def _timing_key(self) -> str:
+        """Digest of what decides the seconds of a target."""
+        scorer = self.scorer
+        settings = [scorer.vsd_delta_mm, not scorer.no_vsd, self.retracer is not None, scorer.models]
+        return digest(["scores", self.context.dataset.name, settings])
 
     def evaluate(self, answers: Sequence[Answer]) -> PoseEvaluation:
-        """Scores of the run's answers, read or made."""
-        fresh = not self.context.store.is_complete(self.ref)
-        if fresh:
-            self._make(answers)
+        """Scores of the run's answers, read from the store or computed."""
+        is_new = not self.context.store.is_complete(self.ref)
+        if is_new:
+            self._compute(answers)
         entry = self.context.store.read(self.ref)
-        seconds = entry.time_s if fresh else 0.0
-        self.context.progress.add("scores", **{"computed" if fresh else "reused": len(answers)}, time_s=seconds)
-        errors = tuple(errors_from_record(record) for record in entry.document["errors"])
-        templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in entry.document["templates"]}
+        counts = {"computed" if is_new else "reused": len(answers)}
+        self.context.progress.add("scores", **counts, time_s=entry.time_s if is_new else 0.0)
+        document = entry.document
+        errors = tuple(errors_from_record(record) for record in document["errors"])
         return PoseEvaluation(
-            ScoringResult(errors, scores_from_record(entry.document["scores"]), self.scorer.models),
-            _by_answer(answers, errors),
-            templates,
-            {(s, i, o, g): error for s, i, o, g, error in entry.document.get("correspondences", [])},
+            scored=ScoringResult(errors, scores_from_record(document["scores"]), self.scorer.models),
+            by_answer=_group_by_answer(answers, errors),
+            templates={(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in document["templates"]},
+            correspondences={(s, i, o, g): error for s, i, o, g, error in document.get("correspondences", [])},
         )
 
-    def _make(self, answers: Sequence[Answer]) -> None:
+    def _compute(self, answers: Sequence[Answer]) -> None:
         start = time.perf_counter()
         with self.context.progress.bar(len(self.scorer.images), "scores", "image") as advance:
-            scored = self.scorer.score([row for _, row in _rows(answers)], progress=advance)
-        of = _by_answer(answers, scored.errors)
-        angles = {
-            instance: error
-            for answer, errors in zip(answers, of, strict=True)
-            if (instance := _instance(answer, errors)) and (error := self._template_error(answer, instance))
-        }
+            scored = self.scorer.score([row for _, row in _result_rows(answers)], progress=advance)
+        by_answer = _group_by_answer(answers, scored.errors)
         document: dict[str, Any] = {
             "errors": [errors_to_record(errors) for errors in scored.errors],
             "scores": scores_to_record(scored.scores),
-            "templates": [[*instance, *asdict(error).values()] for instance, error in angles.items()],
+            "templates": self._template_errors(answers, by_answer),
         }
-        if self.retrace:
-            document["correspondences"] = self._correspondence_errors(answers, of)
-        self.context.store.put_document(self.ref, document, rows=len(answers), time_s=time.perf_counter() - start)
-        self.context.timings.add(self._work, len(self.context.targets), time.perf_counter() - start)
+        if self.retracer:
+            document["correspondences"] = self._correspondence_errors(self.retracer, answers, by_answer)
+        seconds = time.perf_counter() - start
+        self.context.store.put_document(self.ref, document, rows=len(answers), time_s=seconds)
+        self.context.timings.add(self._timing_key, len(self.context.targets), seconds)
+
+    def _template_errors(
+        self, answers: Sequence[Answer], by_answer: Sequence[PoseErrors | None]
+    ) -> list[list[int | float]]:
+        """Each instance with the angles between the matched template and the true view."""
+        error_of_instance: dict[Instance, TemplateError] = {}
+        for answer, errors in zip(answers, by_answer, strict=True):
+            instance = _instance(answer, errors)
+            if instance is None or answer.template_id is None:
+                continue
+            _, _, obj_id, _ = instance
+            T_template = self.templates.read_views(obj_id, [answer.template_id]).T_cam_obj[0]
+            symmetries = self.scorer.mesh(obj_id).model.symmetries
+            error_of_instance[instance] = template_error(T_template, self._true_pose(instance), symmetries)
+        return [[*instance, *asdict(error).values()] for instance, error in error_of_instance.items()]
 
     def _correspondence_errors(
-        self, answers: Sequence[Answer], of: Sequence[PoseErrors | None]
+        self, retracer: Retracer, answers: Sequence[Answer], by_answer: Sequence[PoseErrors | None]
     ) -> list[list[int | float]]:
-        """Each instance with the median error of its answer's correspondences, over the diameter."""
-        assert self.retrace is not None
-        found: list[list[int | float]] = []
+        """Each instance with the median error of its answer's correspondences over the diameter."""
+        rows: list[list[int | float]] = []
+        by_object = sorted(zip(answers, by_answer, strict=True), key=lambda pair: pair[0].obj_id)
         with self.context.progress.bar(len(answers), "correspondences", "answer") as advance:
-            for answer, errors in sorted(zip(answers, of, strict=True), key=lambda pair: pair[0].obj_id):
+            for answer, errors in by_object:  # reads each object's templates once
                 advance(1)
-                instance, traced = _instance(answer, errors), self.retrace(answer)
-                best = traced and traced.hypothesis
-                if instance is None or not best or best.points_obj is None or best.query_px_img is None:
-                    continue
-                scene_id, im_id, obj_id, gt_id = instance
-                T_gt = self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
-                model, K = self.scorer.mesh(obj_id).model, self.context.K((scene_id, im_id))
-                off = correspondence_errors_mm(best.points_obj, best.query_px_img, K, T_gt, model.symmetries)
-                if len(off):
-                    found.append([*instance, float(np.median(off)) / model.diameter_mm])
-        return found
+                instance = _instance(answer, errors)
+                traced = retracer(answer) if instance else None
+                if instance and traced and traced.hypothesis:
+                    error = self._median_correspondence_error(instance, traced.hypothesis)
+                    rows += [] if error is None else [[*instance, error]]
+        return rows
 
-    def _template_error(self, answer: Answer, instance: Instance) -> TemplateError | None:
-        """How far the template that was matched lies from the true view; None where none was."""
-        if answer.template_id is None:
+    def _median_correspondence_error(self, instance: Instance, hypothesis: Hypothesis) -> float | None:
+        """Median error over the diameter; None without correspondences."""
+        if hypothesis.points_obj is None or hypothesis.query_px_img is None:
             return None
-        scene_id, im_id, obj_id, gt_id = instance
-        T_template = self.templates.read_views(obj_id, [answer.template_id]).T_cam_obj[0]
-        T_gt = self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
-        return template_error(T_template, T_gt, self.scorer.mesh(obj_id).model.symmetries)
+        scene_id, im_id, obj_id, _ = instance
+        model, K = self.scorer.mesh(obj_id).model, self.context.K((scene_id, im_id))
+        errors_mm = correspondence_errors_mm(
+            hypothesis.points_obj, hypothesis.query_px_img, K, self._true_pose(instance), model.symmetries
+        )
+        return float(np.median(errors_mm)) / model.diameter_mm if len(errors_mm) else None
+
+    def _true_pose(self, instance: Instance) -> Float[np.ndarray, "4 4"]:
+        scene_id, im_id, _, gt_id = instance
+        return self.context.dataset.ground_truth(scene_id, im_id)[gt_id].T_cam_obj
 
 
-def _rows(answers: Sequence[Answer]) -> list[tuple[int, ResultRow]]:
-    """The estimates among the answers as rows of results, each with its answer's index."""
+def _result_rows(answers: Sequence[Answer]) -> list[tuple[int, ResultRow]]:
+    """The estimates among the answers as result rows, each with the index of its answer."""
     return [
         (index, ResultRow(a.scene_id, a.im_id, a.obj_id, a.score, a.T_cam_obj, -1.0))
         for index, a in enumerate(answers)
@@ -170,19 +184,19 @@ def _rows(answers: Sequence[Answer]) -> list[tuple[int, ResultRow]]:
     ]
 
 
-def _by_answer(answers: Sequence[Answer], errors: Sequence[PoseErrors]) -> tuple[PoseErrors | None, ...]:
-    """Errors of each answer against the instance its detection was made of, otherwise the one with least MSSD."""
+def _group_by_answer(answers: Sequence[Answer], errors: Sequence[PoseErrors]) -> tuple[PoseErrors | None, ...]:
+    """Errors of each answer against the instance of its detection, otherwise against the one with the least MSSD."""
     by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
     for error in errors:
         by_row[error.row].append(error)
-    found: list[PoseErrors | None] = [None] * len(answers)
-    for row, (index, _) in enumerate(_rows(answers)):
-        own = [e for e in by_row[row] if e.gt_id == answers[index].gt_id] or by_row[row]
-        found[index] = min(own, key=lambda e: e.mssd_mm, default=None)
-    return tuple(found)
+    by_answer: list[PoseErrors | None] = [None] * len(answers)
+    for row, (index, _) in enumerate(_result_rows(answers)):
+        same_instance = [e for e in by_row[row] if e.gt_id == answers[index].gt_id] or by_row[row]
+        by_answer[index] = min(same_instance, key=lambda e: e.mssd_mm, default=None)
+    return tuple(by_answer)
 
 
 def _instance(answer: Answer, errors: PoseErrors | None) -> Instance | None:
-    """The annotated instance an answer is of, None where nothing says which."""
+    """The annotated instance of an answer: of its detection, otherwise of its errors; None without either."""
     gt_id = errors.gt_id if answer.gt_id is None and errors is not None else answer.gt_id
     return None if gt_id is None else (answer.scene_id, answer.im_id, answer.obj_id, gt_id)
