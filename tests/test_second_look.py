@@ -99,7 +99,7 @@ def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes,
             off.append(np.linalg.norm(moved, axis=1).mean() / np.ptp(points, axis=0).max())
             assert ("draw" in answer.times_s) == (looks > 0)
         errors[looks] = float(np.median(off))
-        traced = made.retracer()(answers[0])
+        traced = made.replayer()(answers[0])
         assert traced is not None
         np.testing.assert_array_equal(traced.hypothesis.solution.T_cam_obj, answers[0].T_cam_obj)
         assert (traced.hypothesis.rerendered is not None) == (looks > 0)

@@ -32,7 +32,7 @@ from pipeline.graph.plan_text import plan_costs, plan_table
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
-from pipeline.graph.replay import Retraced, Retracer
+from pipeline.graph.replay import Replay, Replayer
 from pipeline.graph.scores import PoseEvaluation, ScoreNodes
 from pipeline.graph.tasks import Counts, Task, Workers, use_threads
 from pipeline.graph.templates import TemplateNodes
@@ -48,7 +48,7 @@ __all__ = [
     "Memory",
     "Node",
     "PoseEvaluation",
-    "Retraced",
+    "Replay",
     "ScoreNodes",
     "Workers",
     "plan_costs",
@@ -127,12 +127,12 @@ class Graph:
 
     def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
         """The node of the poses' scores, optionally with those of the correspondences they were solved from."""
-        retracer = self.retracer() if correspondences else None
-        return ScoreNodes(self.context, self.templates, self.poses, scorer, retracer)
+        replayer = self.replayer() if correspondences else None
+        return ScoreNodes(self.context, self.templates, self.poses, scorer, replayer)
 
-    def retracer(self) -> Retracer:
+    def replayer(self) -> Replayer:
         """Recomputes how an answer came about, from stored features."""
-        return Retracer(self.templates, self.queries, self.poses)
+        return Replayer(self.templates, self.queries, self.poses)
 
     def run_item(self, task: str, item: Any) -> Counts:
         """Run one item of the task with this name, in a worker; returns the counts of its steps."""

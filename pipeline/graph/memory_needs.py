@@ -14,7 +14,7 @@ import torch
 from pipeline.backbones.batching import Footprint, Sized
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
-from pipeline.graph.templates import CROPS_PER_BATCH, DRAWN_LARGER, VIEWS_PER_BATCH
+from pipeline.graph.templates import CROPS_PER_BATCH, RERENDER_SCALE, VIEWS_PER_BATCH
 from pipeline.method import Stages
 
 HALF_BYTES = 2  # stored feature maps are float16
@@ -72,7 +72,7 @@ def estimate_needs(context: Context, proposals: ProposalNodes | None) -> MemoryN
         bank=_bank_bytes(stages, shapes, n),
         view=HALF_BYTES * sum(map_values.values()) + encoded + crop_pixels + FLOAT_BYTES * h * w,
         online=FUSED_VALUE_BYTES * fused_values,
-        rerender=DRAWN_LARGER**2 * crop_pixels * (VIEW_PIXEL_BYTES + 2 * RAY_BYTES) if stages.second_look else 0,
+        rerender=RERENDER_SCALE**2 * crop_pixels * (VIEW_PIXEL_BYTES + 2 * RAY_BYTES) if stages.second_look else 0,
         unknown=unknown,
     )
 

@@ -1,4 +1,4 @@
-"""template features, query features, stages -> poses, by scene and object; and the whole run."""
+"""template features, query features, stages -> poses, one entry per scene and object, and the entry of the run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 
 from pipeline.errors import NoPose
 from pipeline.graph.context import Context, ImageId
-from pipeline.graph.queries import Found, QueryNodes
+from pipeline.graph.queries import CroppedDetection, QueryNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.graph.timings import timing_key
@@ -27,7 +27,7 @@ POSES_VERSION = 2
 
 @dataclass(eq=False)
 class PoseNodes:
-    """Entries of poses. Methods without a verb name entries; ``estimate`` computes what is missing."""
+    """Nodes of poses. Methods named by a noun return references to entries; ``estimate`` computes missing entries."""
 
     context: Context
     templates: TemplateNodes
@@ -35,7 +35,7 @@ class PoseNodes:
 
     @cached_property
     def groups(self) -> dict[tuple[int, int], list[Target]]:
-        """Targets by scene and object: the poses of one group are one entry."""
+        """Targets by (scene_id, obj_id); the poses of a group are one entry."""
         grouped: dict[tuple[int, int], list[Target]] = {}
         for target in self.context.targets:
             grouped.setdefault((target.scene_id, target.obj_id), []).append(target)
@@ -50,7 +50,7 @@ class PoseNodes:
         stages, (_, obj_id) = self.context.stages, group
         recipe = {"kind": "poses", "version": POSES_VERSION, "fallback": stages.fallback}
         recipe |= {name: getattr(stages, name).recipe() for name in ONLINE_STAGES}
-        if stages.second_look:  # what it draws and extracts with is in the keys of the templates and their features
+        if stages.second_look:  # renderer and extractor are in the keys of the templates and their features
             recipe["second look"] = stages.second_look
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
@@ -69,11 +69,11 @@ class PoseNodes:
         return make_ref("poses", recipe, inputs)
 
     def run_ref(self) -> Ref:
-        """The whole run: all poses of all targets."""
+        """The run: the poses of all targets."""
         return make_ref("runs", {"kind": "run"}, {f"{s}/{o}": self.poses((s, o)).key for s, o in self.groups})
 
     def estimate(self) -> list[Answer]:
-        """An answer for every detection of every target and for every target without one."""
+        """An answer for every detection of every target, and one for every target without a detection."""
         ref = self.run_ref()
         if not self.context.store.is_complete(ref):
             self._make(ref)
@@ -96,7 +96,7 @@ class PoseNodes:
             self.context.run_task(self.queries.describing, images, advance)
 
     def _count_reused(self, answers: int) -> None:
-        """Whatever this run stands on and did not compute was reused."""
+        """Count as reused what this run needed and did not compute."""
         usable = sum(len(found) for found in self.queries.of_image.values())
         for step, rows in (("query crops", usable), ("query features", usable), ("poses", answers)):
             count = self.context.progress.step(step)
@@ -127,7 +127,7 @@ class PoseNodes:
         return self.queries.of_target.get((target.scene_id, target.im_id, target.obj_id), [])
 
     def _answers(self, target: Target, bank: StoredBank) -> list[Answer]:
-        """One answer for every detection of a target, or the one that says that there is no detection."""
+        """One answer per detection of a target, or one that says that there is no detection."""
         cropped = {found.index: found for found in self.queries.found((target.scene_id, target.im_id))}
         mine = self._detections(target)
         if not mine:
@@ -135,7 +135,7 @@ class PoseNodes:
             return [NoEstimate(target.scene_id, target.im_id, target.obj_id, "detect", reason)]
         return [self._answer(nth, index, d, cropped.get(index), bank) for nth, (index, d) in enumerate(mine)]
 
-    def _answer(self, nth: int, index: int, d: Detection, found: Found | None, bank: StoredBank) -> Answer:
+    def _answer(self, nth: int, index: int, d: Detection, found: CroppedDetection | None, bank: StoredBank) -> Answer:
         template_id: int | None = None
         try:
             if d.defect is not None:
@@ -149,8 +149,8 @@ class PoseNodes:
         except NoPose as failure:
             return NoEstimate(d.scene_id, d.im_id, d.obj_id, failure.stage, failure.reason, nth, d.gt_id, template_id)
 
-    def query(self, found: Found) -> tuple[Query, dict[str, float]]:
-        """A detection as the online route reads it, with the truth for an oracle alone; its share of the seconds."""
+    def query(self, found: CroppedDetection) -> tuple[Query, dict[str, float]]:
+        """A detection as input of the online route (with ground truth for oracles only), and its seconds."""
         query, shared_s = self.queries.query(found)
         if self.context.stages.oracle:
             query = replace(query, truth=self._truth(found.detection))

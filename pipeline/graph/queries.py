@@ -1,4 +1,4 @@
-"""image, detections -> query crops -> query features, once for every image; and queries read back from them."""
+"""image, detections -> query crops -> query features, once per image; and queries read back from the entries."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from pipeline.store import Ref, make_ref
 
 
 @dataclass(frozen=True)
-class Found:
-    """A usable detection: its index among all detections and its row among its image's query crops."""
+class CroppedDetection:
+    """A detection that has a crop: its index among all detections, and its row in the crops entry of its image."""
 
     index: int
     row: int
@@ -36,19 +36,19 @@ class Found:
 
 @dataclass(eq=False)
 class QueryNodes:
-    """Entries of images. Methods without a verb name entries; ``make_*`` compute what is missing."""
+    """Nodes of images. Methods named by a noun return references to entries; ``make_*`` compute missing entries."""
 
     context: Context
     detecting: DetectionNodes
 
     @property
     def detections(self) -> list[Detection]:
-        """Detections of the targets, made once."""
+        """Detections of the targets, computed once."""
         return self.detecting.all
 
     @cached_property
     def of_target(self) -> dict[tuple[int, int, int], list[tuple[int, Detection]]]:
-        """Detections of each (scene_id, im_id, obj_id) with their index among all, defective ones included."""
+        """Detections by (scene_id, im_id, obj_id) with their index among all; includes defective ones."""
         grouped: dict[tuple[int, int, int], list[tuple[int, Detection]]] = {}
         for index, d in enumerate(self.detections):
             grouped.setdefault((d.scene_id, d.im_id, d.obj_id), []).append((index, d))
@@ -56,7 +56,7 @@ class QueryNodes:
 
     @cached_property
     def of_image(self) -> dict[ImageId, list[tuple[int, Detection]]]:
-        """Usable detections of each image with their index, in order."""
+        """Detections of each image without a defect, with their index, in order."""
         grouped: dict[ImageId, list[tuple[int, Detection]]] = {image: [] for image in self.context.image_ids}
         for index, detection in enumerate(self.detections):
             if detection.defect is None:
@@ -90,27 +90,27 @@ class QueryNodes:
     @cached_property
     def describing(self) -> Task[ImageId]:
         """Crops and features of an image's detections, by image."""
-        return Task("query features", self._describe, self._described)
+        return Task("query features", self._make_image, self._has_image)
 
-    def _described(self, image: ImageId) -> bool:
+    def _has_image(self, image: ImageId) -> bool:
         complete = self.context.store.is_complete
         if not complete(self.crops(image)):
             return False
         layers = self.context.stages.layers
         return not self.found(image) or all(complete(self.features(image, layer)) for layer in layers)
 
-    def _describe(self, image: ImageId, advance: Advance) -> None:
+    def _make_image(self, image: ImageId, advance: Advance) -> None:
         self.make_features(image, self.make_crops(image))
         advance(1)
 
-    def make_crops(self, image: ImageId) -> list[Found]:
-        """Crop an image's detections; those that cannot be cropped are left out, with their reason."""
+    def make_crops(self, image: ImageId) -> list[CroppedDetection]:
+        """Crop an image's detections; the entry records why a detection could not be cropped."""
         ref = self.crops(image)
         if self.context.store.is_complete(ref):
             self.context.progress.add("query crops", reused=self.context.store.read(ref).rows)
             return self.found(image)
         began = time.perf_counter()
-        crops, document = self._cropped(image)
+        crops, document = self._crop_detections(image)
         if not crops:
             self.context.store.put_document(ref, document, rows=0)
             return []
@@ -127,8 +127,8 @@ class QueryNodes:
         )
         return self.found(image)
 
-    def _cropped(self, image: ImageId) -> tuple[list[Crop], dict[str, object]]:
-        """Crops, and which of the image's usable detections they are or why there is none."""
+    def _crop_detections(self, image: ImageId) -> tuple[list[Crop], dict[str, object]]:
+        """Crops, and a document that says which detections they are and why others failed."""
         usable = self.of_image[image]
         photo = self.context.dataset.image(*image)
         crops, kept, failed = [], [], {}
@@ -141,21 +141,21 @@ class QueryNodes:
                 failed[str(position)] = failure.reason
         return crops, {"kept": kept, "failed": failed}
 
-    def found(self, image: ImageId) -> list[Found]:
+    def found(self, image: ImageId) -> list[CroppedDetection]:
         """The detections of an image that have a crop."""
         usable = self.of_image[image]
         kept = self.context.store.read(self.crops(image)).document["kept"]
-        return [Found(usable[position][0], row, usable[position][1]) for row, position in enumerate(kept)]
+        return [CroppedDetection(usable[position][0], row, usable[position][1]) for row, position in enumerate(kept)]
 
-    def make_features(self, image: ImageId, found: Sequence[Found]) -> None:
-        """Extract what is missing of the features of an image's detections."""
+    def make_features(self, image: ImageId, found: Sequence[CroppedDetection]) -> None:
+        """Extract the missing features of an image's detections."""
         if found:
             refs = {layer: self.features(image, layer) for layer in self.context.stages.layers}
             self.context.extract(
                 "query features", "", refs, len(found), lambda rows: self._crops_of(image, found, rows)
             )
 
-    def _crops_of(self, image: ImageId, found: Sequence[Found], rows: Sequence[int]) -> Crops:
+    def _crops_of(self, image: ImageId, found: Sequence[CroppedDetection], rows: Sequence[int]) -> Crops:
         entry = self.context.store.read(self.crops(image))
         geometry = None
         if self.context.stages.extract.needs_geometry:
@@ -171,7 +171,7 @@ class QueryNodes:
         return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
 
     def true_pose(self, detection: Detection, *, asked_by: str = "extract=coordinates") -> np.ndarray:
-        """T_cam_obj of the instance a detection was made of, for oracles. Raises BadInput for other detections."""
+        """T_cam_obj (mm) of a detection's ground-truth instance, for oracles. Raises BadInput where it has none."""
         if detection.gt_id is None:
             raise BadInput(
                 asked_by,
@@ -181,8 +181,8 @@ class QueryNodes:
         T = self.context.dataset.ground_truth(detection.scene_id, detection.im_id)[detection.gt_id].T_cam_obj
         return rigid(nearest_rotation(T[:3, :3]), T[:3, 3])  # published rotations are rounded, rays need exact ones
 
-    def query(self, found: Found) -> tuple[Query, dict[str, float]]:
-        """A detection as the online route reads it, and its share of its image's seconds."""
+    def query(self, found: CroppedDetection) -> tuple[Query, dict[str, float]]:
+        """A detection as input of the online route, and its share of the seconds of its image."""
         image = (found.detection.scene_id, found.detection.im_id)
         entries = {layer: self.context.store.read(self.features(image, layer)) for layer in self.context.stages.layers}
         crops = self.context.store.read(self.crops(image))

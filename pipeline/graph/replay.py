@@ -1,4 +1,4 @@
-"""answer -> how it came about: the route of its template once more, from stored features."""
+"""answer -> its intermediate results: repeat the route of its template from stored features."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pipeline.route import replay_hypothesis
 
 
 @dataclass(frozen=True, eq=False)
-class Retraced:
-    """A detection's crop, that of the view it was matched with, and what became of both; None: not reached."""
+class Replay:
+    """Crops of a detection and of the view it was matched with, and their hypothesis; None for steps not reached."""
 
     detection: Detection
     query_rgb: UInt8[np.ndarray, "S S 3"]
@@ -28,15 +28,15 @@ class Retraced:
 
 
 @dataclass(eq=False)
-class Retracer:
-    """Traces answers of one run again."""
+class Replayer:
+    """Repeats the online route of answers of one run."""
 
     templates: TemplateNodes
     queries: QueryNodes
     poses: PoseNodes
 
-    def __call__(self, answer: Answer) -> Retraced | None:
-        """How an answer came about; None where there is no crop to show."""
+    def __call__(self, answer: Answer) -> Replay | None:
+        """The intermediate results of an answer; None where there is no crop to show."""
         if answer.detection_id is None:
             return None
         context, image = self.queries.context, (answer.scene_id, answer.im_id)
@@ -46,11 +46,11 @@ class Retracer:
             return None
         query_rgb = context.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
         if answer.template_id is None:
-            return Retraced(detection, query_rgb)
+            return Replay(detection, query_rgb)
         score = answer.template_score if isinstance(answer, PoseEstimate) else 0.0
         bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
         hypothesis = replay_hypothesis(context.stages, query, bank, answer.template_id, score)
         if hypothesis.rerendered is not None:
-            return Retraced(detection, query_rgb, hypothesis.rerendered.rgb, hypothesis)
+            return Replay(detection, query_rgb, hypothesis.rerendered.rgb, hypothesis)
         crops = context.store.read(self.templates.crops(answer.obj_id))
-        return Retraced(detection, query_rgb, crops.array("rgb", [answer.template_id])[0], hypothesis)
+        return Replay(detection, query_rgb, crops.array("rgb", [answer.template_id])[0], hypothesis)

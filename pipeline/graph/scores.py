@@ -16,7 +16,7 @@ from pipeline.bop.results import ResultRow
 from pipeline.graph.context import Context
 from pipeline.graph.plan import Node
 from pipeline.graph.poses import PoseNodes
-from pipeline.graph.replay import Retracer
+from pipeline.graph.replay import Replayer
 from pipeline.graph.templates import TemplateNodes
 from pipeline.io.digests import files_digest
 from pipeline.items.online import Hypothesis
@@ -56,20 +56,20 @@ class PoseEvaluation:
 
 @dataclass(eq=False)
 class ScoreNodes:
-    """The entry of a run's scores. ``retracer`` recomputes correspondences; None leaves them out of the scores."""
+    """The entry of a run's scores. ``replayer`` recomputes correspondences; None leaves them out of the scores."""
 
     context: Context
     templates: TemplateNodes
     poses: PoseNodes
     scorer: Scorer
-    retracer: Retracer | None = None
+    replayer: Replayer | None = None
 
     @cached_property
     def ref(self) -> Ref:
         """Scores of the run's poses."""
         scorer, data = self.scorer, self.context.dataset
         recipe = {"kind": "scores", "version": SCORES_VERSION, "vsd_delta_mm": scorer.vsd_delta_mm}
-        recipe |= {"correspondences": True} if self.retracer else {}
+        recipe |= {"correspondences": True} if self.replayer else {}
         depth = "" if scorer.no_vsd else files_digest({str(image): data.depth_path(*image) for image in scorer.images})
         meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.context.object_ids}
         info = data.model_path(0, folder=scorer.models).with_name("models_info.json")
@@ -92,7 +92,7 @@ class ScoreNodes:
     def _timing_key(self) -> str:
         """Digest of what decides the seconds of a target."""
         scorer = self.scorer
-        settings = [scorer.vsd_delta_mm, not scorer.no_vsd, self.retracer is not None, scorer.models]
+        settings = [scorer.vsd_delta_mm, not scorer.no_vsd, self.replayer is not None, scorer.models]
         return digest(["scores", self.context.dataset.name, settings])
 
     def evaluate(self, answers: Sequence[Answer]) -> PoseEvaluation:
@@ -122,8 +122,8 @@ class ScoreNodes:
             "scores": scores_to_record(scored.scores),
             "templates": self._template_errors(answers, by_answer),
         }
-        if self.retracer:
-            document["correspondences"] = self._correspondence_errors(self.retracer, answers, by_answer)
+        if self.replayer:
+            document["correspondences"] = self._correspondence_errors(self.replayer, answers, by_answer)
         seconds = time.perf_counter() - start
         self.context.store.put_document(self.ref, document, rows=len(answers), time_s=seconds)
         self.context.timings.add(self._timing_key, len(self.context.targets), seconds)
@@ -144,7 +144,7 @@ class ScoreNodes:
         return [[*instance, *asdict(error).values()] for instance, error in error_of_instance.items()]
 
     def _correspondence_errors(
-        self, retracer: Retracer, answers: Sequence[Answer], by_answer: Sequence[PoseErrors | None]
+        self, replayer: Replayer, answers: Sequence[Answer], by_answer: Sequence[PoseErrors | None]
     ) -> list[list[int | float]]:
         """Each instance with the median error of its answer's correspondences over the diameter."""
         rows: list[list[int | float]] = []
@@ -153,7 +153,7 @@ class ScoreNodes:
             for answer, errors in by_object:  # reads each object's templates once
                 advance(1)
                 instance = _instance(answer, errors)
-                traced = retracer(answer) if instance else None
+                traced = replayer(answer) if instance else None
                 if instance and traced and traced.hypothesis:
                     error = self._median_correspondence_error(instance, traced.hypothesis)
                     rows += [] if error is None else [[*instance, error]]

@@ -1,4 +1,4 @@
-"""mesh -> templates -> crops -> features -> fits, once for every object; and the bank read back from them."""
+"""mesh -> templates -> crops -> features -> fits, once per object; and the bank read back from the entries."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from pipeline.store import Layout, Ref, make_ref
 
 VIEWS_PER_BATCH = 8
 CROPS_PER_BATCH = 50
-DRAWN_LARGER = 2  # a second look's picture, a side, than the crop that is made of it
+RERENDER_SCALE = 2  # side of a rerendered view relative to its crop
 
 Pose = Float[np.ndarray, "4 4"]
 Matrix = Float[np.ndarray, "3 3"]
@@ -37,7 +37,7 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass(eq=False)
 class StoredBank:
-    """One object's templates as the online route reads them; views are read one by one and the last few kept."""
+    """One object's templates as input of the online route; views are read one by one, the last few stay in memory."""
 
     maps: Callable[[], torch.Tensor]
     masks: Callable[[], torch.Tensor]
@@ -48,7 +48,7 @@ class StoredBank:
 
     @cached_property
     def features(self) -> torch.Tensor:
-        """Features of the match layer, float16; read when a matcher asks, for they are most of what an object takes."""
+        """Features of the match layer, float16; the largest array of an object, so read only when a matcher asks."""
         return self.maps()
 
     @cached_property
@@ -58,20 +58,20 @@ class StoredBank:
 
     @cached_property
     def mask(self) -> torch.Tensor:
-        """Crop masks of all templates; read when a matcher asks."""
+        """Crop masks of all templates; read when first asked for."""
         return self.masks()
 
     @cached_property
     def T_cam_obj(self) -> np.ndarray:
-        """Poses of all templates; read when an oracle asks."""
+        """Poses of all templates; read when first asked for."""
         return self.poses()
 
 
 @dataclass(eq=False)
 class TemplateNodes:
-    """Entries of objects. Methods without a verb name entries; ``make_*`` compute what is missing.
+    """Nodes of objects. Methods named by a noun return references to entries; ``make_*`` compute missing entries.
 
-    ``views``: whole templates of an object that a bank keeps for the next query.
+    ``views``: number of full template views that a bank keeps in memory.
     """
 
     context: Context
@@ -96,7 +96,7 @@ class TemplateNodes:
         return self.context.features(layer, {"crops": self.crops(obj_id).key})
 
     def make_templates(self, obj_id: int) -> int:
-        """Render what is missing of an object's templates; returns how many there are."""
+        """Render an object's missing templates; returns the number of templates."""
         ref = self.templates(obj_id)
         if self.context.store.is_complete(ref):
             rows = self.context.store.read(ref).rows
@@ -133,7 +133,7 @@ class TemplateNodes:
         return Templates(entry.array("rgb", rows), depth_mm, depth_mm > 0, K, entry.array("T_cam_obj", rows))
 
     def make_crops(self, obj_id: int, count: int) -> None:
-        """Crop what is missing of an object's templates."""
+        """Crop an object's templates, where that is missing."""
         ref = self.crops(obj_id)
 
         def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
@@ -150,7 +150,7 @@ class TemplateNodes:
         )  # fmt: skip
 
     def make_features(self, obj_id: int, count: int, layers: Sequence[int]) -> None:
-        """Extract what is missing of an object's template features."""
+        """Extract an object's missing template features."""
         refs = {layer: self.features(obj_id, layer) for layer in layers}
         self.context.extract(
             "template features", f"features of object {obj_id}", refs, count, lambda rows: self._crops_of(obj_id, rows)
@@ -165,14 +165,14 @@ class TemplateNodes:
         return Crops(entry.array("rgb", rows), entry.array("mask", rows), entry.array("A_crop_img", rows), geometry)
 
     def fitted(self, obj_id: int, fit: Fit) -> Ref:
-        """What a fit makes of an object's template features."""
+        """Arrays of a fit to an object's template features."""
         inputs = {"features": self.features(obj_id, fit.layer).key}
         if fit.base is not None:
             inputs["base"] = self.fitted(obj_id, fit.base).key
         return make_ref("fitted", {"kind": "fitted", "fit": fit.recipe()}, inputs)
 
     def make_fitted(self, obj_id: int) -> None:
-        """Fit what is missing to an object's templates; what a fit stands on comes before it."""
+        """Compute an object's missing fits, each after the fit that it is based on."""
         cells, began = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer)), time.perf_counter()
         missing = [
             fit for fit in self.context.stages.fits if not self.context.store.is_complete(self.fitted(obj_id, fit))
@@ -199,7 +199,7 @@ class TemplateNodes:
         self.context.fill("fits", "", {ref: layouts}, 1, 1, compute)
 
     def read_fitted(self, obj_id: int, fit: Fit, *, device: str) -> FittedArrays:
-        """Arrays of a fit and of all it stands on."""
+        """Arrays of a fit and of its bases."""
         arrays: dict[str, torch.Tensor] = {}
         for part in chain(fit):
             entry = self.context.store.read(self.fitted(obj_id, part))
@@ -207,7 +207,7 @@ class TemplateNodes:
         return arrays
 
     def _cells(self, obj_id: int, layer: int) -> TemplateCells:
-        """Foreground of an object's templates, float16; whole maps are read a few at a time."""
+        """Features of the foreground cells of an object's templates, float16; maps are read in batches."""
         maps, crops = self.context.store.read(self.features(obj_id, layer)), self.context.store.read(self.crops(obj_id))
         features, template = [], []
         for first in range(0, crops.rows, CROPS_PER_BATCH):
@@ -219,10 +219,10 @@ class TemplateNodes:
 
     @cached_property
     def onboarding(self) -> Task[int]:
-        """Everything offline, by object."""
-        return Task("onboarding", self._onboard, self._onboarded)
+        """The offline steps, by object."""
+        return Task("onboarding", self._onboard, self._is_onboarded)
 
-    def _onboarded(self, obj_id: int) -> bool:
+    def _is_onboarded(self, obj_id: int) -> bool:
         refs = [self.templates(obj_id), self.crops(obj_id)]
         refs += [self.features(obj_id, layer) for layer in self.context.stages.layers]
         refs += [self.fitted(obj_id, fit) for fit in self.context.stages.fits]
@@ -230,14 +230,14 @@ class TemplateNodes:
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
-        self.context.models.discard(obj_id)  # and with the mesh what the renderer made of it, three times as large
+        self.context.models.discard(obj_id)  # frees the renderer's structures as well, three times the size of the mesh
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.context.stages.layers)
         self.make_fitted(obj_id)
         advance(1)
 
     def feature_bytes(self) -> int:
-        """What the stored features of all objects take."""
+        """Bytes of the stored features of all objects."""
         refs = [
             self.features(obj_id, layer) for obj_id in self.context.object_ids for layer in self.context.stages.layers
         ]
@@ -245,7 +245,7 @@ class TemplateNodes:
 
     @cached_property
     def bank(self) -> Callable[[int], StoredBank]:
-        """An object's templates for the online route; those of one object stay in memory, whoever asks."""
+        """An object's templates for the online route; those of the last object stay in memory."""
         return lru_cache(maxsize=1)(self._bank)
 
     def _bank(self, obj_id: int) -> StoredBank:
@@ -275,18 +275,18 @@ class TemplateNodes:
             maps=lambda: self.context.tensor(features[self.context.stages.match.layer].array("maps")),
             masks=lambda: self.context.tensor(crops.array("mask")),
             view=view,
-            draw=partial(self._drawn, obj_id),
+            draw=partial(self._render_view, obj_id),
             poses=lambda: templates.array("T_cam_obj"),
             fitted=fitted,
         )
 
-    def _drawn(self, obj_id: int, T_cam_obj: Pose, A_crop_img: Matrix, K: Matrix) -> TemplateView:
-        """The object in a pose as a query's crop shows it: drawn twice as large, shrunk as templates are."""
+    def _render_view(self, obj_id: int, T_cam_obj: Pose, A_crop_img: Matrix, K: Matrix) -> TemplateView:
+        """Render the object in a pose as a crop of a query shows it: twice as large, then resampled like a template."""
         stages, size = self.context.stages, self.context.stages.crop.size
         K_crop, R_crop_cam = crop_camera(A_crop_img, K)
-        A_drawn_crop = resize_affine(float(DRAWN_LARGER))
+        A_drawn_crop = resize_affine(float(RERENDER_SCALE))
         K_drawn, T_drawn_obj = A_drawn_crop @ K_crop, rigid(R_crop_cam, np.zeros(3)) @ T_cam_obj
-        size_hw = (DRAWN_LARGER * size,) * 2
+        size_hw = (RERENDER_SCALE * size,) * 2
         rgb, depth_mm = stages.render.render(self.context.model(obj_id).mesh, K_drawn, T_drawn_obj[None], size_hw)
         A_crop_drawn = np.linalg.inv(A_drawn_crop)
         crop = np.rint(resample(rgb[0], A_crop_drawn, size=size)).clip(0, 255).astype(np.uint8)

@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from pipeline.graph import PoseEvaluation, Retraced
+from pipeline.graph import PoseEvaluation, Replay
 from pipeline.graph.context import ImageId
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
@@ -60,7 +60,7 @@ class Pictures:
         if not count:
             return []
         start, drawn = time.perf_counter(), 0
-        replay = self.folder.graph.retracer()
+        replay = self.folder.graph.replayer()
         relative_mssd = [None if errors is None else errors.relative_mssd for errors in self.errors]
         chosen = pick_cases(relative_mssd, count=count, obj_ids=[answer.obj_id for answer in self.answers])
         with self.folder.context.progress.bar(len(chosen), "gallery", "picture") as advance:
@@ -78,7 +78,7 @@ class Pictures:
         seconds = time.perf_counter() - start
         self.folder.context.progress.add(step, computed=drawn, reused=total - drawn, time_s=seconds)
 
-    def _card(self, index: int, replayed: Retraced) -> Card:
+    def _card(self, index: int, replayed: Replay) -> Card:
         answer, best = self.answers[index], replayed.hypothesis
         return Card(
             photo=self.folder.context.dataset.image(answer.scene_id, answer.im_id),
