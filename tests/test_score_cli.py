@@ -167,7 +167,7 @@ def test_lint_lists_every_fault(dzop):
     assert ran.status == 1
     for part in (
         "needs <method>_<dataset>-<split>.csv",
-        "line 2, field R: found a matrix whose R R^T is off the identity",
+        "line 2, field R: found a matrix whose R R^T differs from the identity",
         "line 4, field time: found 0.5 after 0.9",
         "line 6: found 6 columns",
         "found scene 7, image 5",

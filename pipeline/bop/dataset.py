@@ -1,4 +1,4 @@
-"""BOP folder -> targets, photographs, cameras, ground truth, object models."""
+"""BOP folder -> targets, images, cameras, ground truth, object models."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
 from pipeline.spec import spec
 
-# 0.13 is the most over the targets of LM-O and YCB-V that the tests read; a K of half the size gives 0.9 and more
-_OFF_DIAGONALS = 0.5
+# Box diagonals. The largest offset over the targets of LM-O and YCB-V in the tests is 0.13; a K for an image of half
+# the size gives 0.9 or more.
+_MAX_OFFSET = 0.5
 BOP_WIDTH_PX = {"lm": 640, "lmo": 640, "ycbv": 640, "tless": 720, "tudl": 640, "icbin": 640, "hb": 640, "itodd": 1280}
-"""Widths of BOP's test images, for scoring without them."""
+"""Widths of BOP's test images, used when scoring without the images."""
 
 
 @spec
 class DatasetConfig:
-    """Which dataset, and where it lies. ``root`` is a location: files enter keys by their bytes, never by this."""
+    """Which dataset, and where. ``root`` is only a location: keys depend on the contents of files, not on it."""
 
     name: str
     root: str
@@ -46,10 +47,10 @@ class DatasetConfig:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A BOP dataset whose targets have images, cameras and models. Pixels and meshes are read when asked for.
+    """A BOP dataset whose targets have images, cameras and models. Pixels and meshes are read on demand.
 
-    ``targets`` are sorted by scene, image and object; ``models_info`` is empty when models_info.json is missing.
-    Every method raises BadInput, in one line that names file, scene, image and field, for what cannot be used.
+    ``targets`` are sorted by scene, image and object; ``models_info`` is empty without models_info.json. Every method
+    raises BadInput for input that cannot be used, in one line with the file, scene, image and field.
     """
 
     name: str
@@ -62,26 +63,26 @@ class Dataset:
 
     @property
     def object_ids(self) -> tuple[int, ...]:
-        """The objects that the targets ask for."""
+        """Ids of the targets' objects, sorted."""
         return tuple(sorted({target.obj_id for target in self.targets}))
 
     @property
     def images(self) -> tuple[tuple[int, int], ...]:
-        """(scene_id, im_id) of the images that the targets ask for."""
+        """(scene_id, im_id) of the targets' images, sorted."""
         return tuple(sorted({(target.scene_id, target.im_id) for target in self.targets}))
 
     @property
     def location_field(self) -> str:
-        """The field by which a user said where the object is, "" where nothing did."""
+        """The config field that gives the object's location, such as ``dataset.mask``; "" without one."""
         return ""
 
     @property
     def given_bbox_xyxy(self) -> Box | None:
-        """A box that came with the dataset's settings instead of a file; it enters the keys of detections."""
+        """A box from the config instead of a file; it is part of the keys of detections."""
         return None
 
     def scene(self, scene_id: int) -> Scene:
-        """The scene's folder; its JSON files are read once."""
+        """The scene; its JSON files are read once."""
         if scene_id not in self._scenes:
             folder = self.root / self.split / f"{scene_id:06d}"
             if not folder.is_dir():
@@ -92,28 +93,28 @@ class Dataset:
         return self._scenes[scene_id]
 
     def image(self, scene_id: int, im_id: int) -> Image:
-        """The photograph, 8-bit rgb, with its K."""
+        """The image, 8-bit rgb, with its K."""
         rgb = read_rgb(self.image_path(scene_id, im_id))
         K = self.K(scene_id, im_id)
         check_K(K, (rgb.shape[0], rgb.shape[1]), self.where_camera(scene_id, im_id))
         return Image(scene_id, im_id, rgb, K)
 
     def image_path(self, scene_id: int, im_id: int) -> Path:
-        """The photograph's file."""
+        """The image's file."""
         return self.scene(scene_id).image_path(im_id)
 
     def image_size(self, scene_id: int, im_id: int) -> tuple[int, int]:
-        """(h, w) of the photograph, from its header."""
+        """(h, w) of the image, from its header."""
         return image_size(self.image_path(scene_id, im_id))
 
     def image_width(self, scene_id: int, im_id: int) -> int:
-        """Width of the photograph, px: from its file or its depth image's; where neither lies here, BOP's.
+        """Width of the image, px: of its file, its depth image, camera*.json, or BOP's known width, in this order.
 
-        Raises BadInput when no file says it and the dataset is not one of BOP's.
+        Raises BadInput if none of them gives it.
         """
-        for find in (self.image_path, self.depth_path):
+        for find_file in (self.image_path, self.depth_path):
             try:
-                return image_size(find(scene_id, im_id))[1]
+                return image_size(find_file(scene_id, im_id))[1]
             except BadInput:
                 continue
         for path in sorted(self.root.glob("camera*.json")):
@@ -123,10 +124,10 @@ class Dataset:
         if self.name in BOP_WIDTH_PX:
             return BOP_WIDTH_PX[self.name]
         where = describe_place(self.scene(scene_id).folder, scene=scene_id, image=im_id)
-        raise BadInput(where, found="neither a photograph nor a depth image", needed="one of them, for its width")
+        raise BadInput(where, found="neither an image nor a depth image", needed="one of them, for its width")
 
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
-        """The photograph's camera matrix."""
+        """The image's camera matrix, px."""
         return self.scene(scene_id).camera(im_id).K
 
     def depth_path(self, scene_id: int, im_id: int) -> Path:
@@ -134,7 +135,7 @@ class Dataset:
         return self.scene(scene_id).depth_path(im_id)
 
     def depth_mm(self, scene_id: int, im_id: int) -> Float32[np.ndarray, "H W"]:
-        """Measured depth along the optical axis, mm, 0 where unknown."""
+        """Measured depth along the optical axis, mm; 0 where unknown."""
         scale = self.scene(scene_id).camera(im_id).depth_scale
         if scale is None:
             where = describe_place(self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id)
@@ -150,15 +151,15 @@ class Dataset:
         return self.scene(scene_id).ground_truth(im_id)
 
     def mask_path(self, scene_id: int, im_id: int, gt_id: int, *, visible: bool = True) -> Path:
-        """File of an instance's mask, its visible part or its whole silhouette; it may be missing."""
+        """File of an instance's mask, visible part or full silhouette. The file may be missing."""
         return self.scene(scene_id).mask_path(im_id, gt_id, visible=visible)
 
     def mask(self, scene_id: int, im_id: int, gt_id: int, *, visible: bool = True) -> Bool[np.ndarray, "H W"]:
-        """An instance's mask, its visible part or its whole silhouette."""
+        """An instance's mask, visible part or full silhouette."""
         return read_mask(self.mask_path(scene_id, im_id, gt_id, visible=visible))
 
     def model_path(self, obj_id: int, *, folder: str | None = None) -> Path:
-        """The object's mesh file in ``folder`` (None: the dataset's models)."""
+        """The object's mesh file, in ``folder`` (None: the dataset's models)."""
         return self.root / (folder or self.models) / f"obj_{obj_id:06d}.ply"
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
@@ -168,7 +169,7 @@ class Dataset:
         return read_model(path, obj_id, infos, distances_mm=self._distances_mm(obj_id))
 
     def mesh_digest(self, obj_id: int) -> str:
-        """Digest of the object's mesh as ``object_model`` has it, without what a look at its triangles takes."""
+        """``object_model(obj_id).mesh.digest``, without parsing the mesh where its format allows."""
         return mesh_digest(self.model_path(obj_id))
 
     def _distances_mm(self, obj_id: int) -> list[float]:
@@ -177,7 +178,7 @@ class Dataset:
         return [float(np.linalg.norm(gt.T_cam_obj[:3, 3])) for gts in annotated for gt in gts if gt.obj_id == obj_id]
 
     def where_camera(self, scene_id: int, im_id: int) -> str:
-        """Where the file gives an image's K, for messages."""
+        """Location of an image's K in its file, for error messages."""
         return describe_place(
             self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id, field="cam_K"
         )
@@ -192,19 +193,21 @@ def open_dataset(
     targets: str | None = "test_targets_bop19.json",
     photographs: bool = True,
 ) -> Dataset:
-    """The dataset at ``root``, with every target's image, camera and model seen to be there.
+    """The dataset at ``root``, after checking that every target has an image, a camera and a model.
 
-    ``photographs`` False: annotations and models alone, for scores. ``models``: folder of the meshes (T-LESS:
-    models_cad or models_reconst). ``targets``: file of the targets; None, or a file that is not there, asks for every
-    annotated instance of every image. Only JSON files and image headers are read. Raises BadInput for the first fault.
+    ``photographs`` False: do not check images, which scoring does not need. ``models``: folder of the meshes (T-LESS:
+    models_cad or models_reconst). ``targets``: file of the targets; with None or a missing file, every annotated
+    instance of every image is a target. Reads only JSON files and image headers. Raises BadInput at the first error.
     """
     _check_folder(root, "the dataset", lambda folder: True)
     _check_folder(root / split, "a split", lambda folder: any(folder.glob("[0-9]" * 6)))
     _check_folder(root / models, "object models", lambda folder: any(folder.glob("obj_*.ply")))
-    bare = Dataset(name, root, split, models, read_models_info(root / models / "models_info.json"))
+    dataset = Dataset(name, root, split, models, read_models_info(root / models / "models_info.json"))
     path = None if targets is None else root / targets
-    asked = _annotated_targets(bare) if path is None or not path.exists() else _read_targets(path)
-    dataset = replace(bare, targets=asked)
+    if path is not None and path.exists():
+        dataset = replace(dataset, targets=_read_targets(path))
+    else:
+        dataset = replace(dataset, targets=_list_annotated_targets(dataset))
     for obj_id in dataset.object_ids:
         check_model_files(dataset.model_path(obj_id), obj_id, dataset.models_info)
     for scene_id, im_id in dataset.images if photographs else ():
@@ -212,71 +215,78 @@ def open_dataset(
     return dataset
 
 
-def _check_folder(path: Path, what: str, fits: Callable[[Path], bool]) -> None:
+def _check_folder(path: Path, what: str, is_candidate: Callable[[Path], bool]) -> None:
+    """Raise BadInput for a missing folder, listing the sibling folders that could be meant."""
     if path.is_dir():
         return
-    others = sorted(p.name for p in path.parent.iterdir() if p.is_dir() and fits(p)) if path.parent.is_dir() else []
-    there = f" (there: {', '.join(others[:12])})" if others else ""
-    raise BadInput(path, found="no such folder", needed=f"the folder of {what}{there}")
+    siblings = [p for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
+    candidates = sorted(p.name for p in siblings if is_candidate(p))
+    hint = f" (there: {', '.join(candidates[:12])})" if candidates else ""
+    raise BadInput(path, found="no such folder", needed=f"the folder of {what}{hint}")
 
 
 def _read_targets(path: Path) -> tuple[Target, ...]:
     records = read_json(path)
     if not isinstance(records, list) or not records:
         raise BadInput(path, found=abbreviate(records), needed="a list of targets: scene_id, im_id, obj_id, inst_count")
-    asked = []
+    targets = []
     for index, record in enumerate(records):
         where = describe_place(path, target=index)
         ids = [get_integer(record, name, where) for name in ("scene_id", "im_id", "obj_id", "inst_count")]
         if min(ids) < 0 or ids[-1] < 1:
             raise BadInput(where, found=abbreviate(record), needed="ids >= 0 and inst_count >= 1")
-        asked.append(Target(*ids))
-    repeated = [key for key, n in Counter((t.scene_id, t.im_id, t.obj_id) for t in asked).items() if n > 1]
+        targets.append(Target(*ids))
+    repeated = [key for key, n in Counter((t.scene_id, t.im_id, t.obj_id) for t in targets).items() if n > 1]
     if repeated:
         scene_id, im_id, obj_id = repeated[0]
         where = describe_place(path, scene=scene_id, image=im_id, object=obj_id)
         raise BadInput(where, found="the target twice", needed="one entry with its inst_count")
-    return _sorted(asked)
+    return _sort_targets(targets)
 
 
-def _annotated_targets(dataset: Dataset) -> tuple[Target, ...]:
+def _list_annotated_targets(dataset: Dataset) -> tuple[Target, ...]:
+    """One target per object and image, with as many instances as are annotated."""
     split = dataset.root / dataset.split
     folders = sorted(p for p in split.iterdir() if p.is_dir() and p.name.isdigit())
-    asked = []
+    targets = []
     for scene in (dataset.scene(int(folder.name)) for folder in folders):
         for im_id in scene.annotations:
             counts = Counter(gt.obj_id for gt in scene.ground_truth(im_id))
-            asked += [Target(scene.scene_id, im_id, obj_id, n) for obj_id, n in counts.items()]
-    if not asked:
+            targets += [Target(scene.scene_id, im_id, obj_id, n) for obj_id, n in counts.items()]
+    if not targets:
         raise BadInput(split, found="no annotated image", needed="a targets file, or scenes with scene_gt.json")
-    return _sorted(asked)
+    return _sort_targets(targets)
 
 
-def _sorted(targets: Sequence[Target]) -> tuple[Target, ...]:
+def _sort_targets(targets: Sequence[Target]) -> tuple[Target, ...]:
     return tuple(sorted(targets, key=lambda t: (t.scene_id, t.im_id, t.obj_id)))
 
 
 def _check_image(dataset: Dataset, scene_id: int, im_id: int) -> None:
-    """Raise BadInput for a target's image that is missing, or whose K cannot be its own."""
+    """Raise BadInput for a target's image that is missing or whose K belongs to another image size."""
     K, size_hw = dataset.K(scene_id, im_id), dataset.image_size(scene_id, im_id)
     where = dataset.where_camera(scene_id, im_id)
     check_K(K, size_hw, where)
     if not dataset.has_ground_truth(scene_id):
         return
-    apart = [a for gt in dataset.ground_truth(scene_id, im_id) if (a := _apart(dataset, gt, K, size_hw)) is not None]
-    off = sum(a > _OFF_DIAGONALS for a in apart)
-    if off > len(apart) / 2:
-        found = f"a K that projects {off} of {len(apart)} annotated objects away from their boxes"
+    found = [_projection_offset(dataset, gt, K, size_hw) for gt in dataset.ground_truth(scene_id, im_id)]
+    offsets = [offset for offset in found if offset is not None]
+    wrong = sum(offset > _MAX_OFFSET for offset in offsets)
+    if wrong > len(offsets) / 2:
         raise BadInput(
-            where, found=found, needed=f"the K of this image of {size_hw[1]} x {size_hw[0]} (width x height)"
+            where,
+            found=f"a K that projects {wrong} of {len(offsets)} annotated objects away from their boxes",
+            needed=f"the K of this image of {size_hw[1]} x {size_hw[0]} (width x height)",
         )
 
 
-def _apart(dataset: Dataset, gt: GroundTruth, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> float | None:
-    """Distance of an instance's projected centre from the centre of its annotated box, in diagonals of that box.
+def _projection_offset(
+    dataset: Dataset, gt: GroundTruth, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]
+) -> float | None:
+    """Distance between an instance's projected centre and the centre of its annotated box, in box diagonals.
 
-    It tells a K of another image size, which its own numbers do not. None where there is nothing to compare: no
-    box wholly inside the image, or no centre in models_info.json.
+    A large value reveals a K of another image size, which K alone does not. None if the box is not fully inside the
+    image or models_info.json has no centre.
     """
     info, (h, w) = dataset.models_info.get(gt.obj_id), size_hw
     if info is None or info.centre is None or gt.bbox_obj_xyxy is None:

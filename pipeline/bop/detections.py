@@ -1,4 +1,4 @@
-"""Detections -> a file in the json of BOP's default detections, which ``detect=json`` reads back."""
+"""Detections -> a JSON file in the format of BOP's default detections, which ``detect=json`` reads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pipeline.items.views import Detection
 
 
 def write_detections(path: Path, detections: Sequence[Detection]) -> None:
-    """Every detection that can be used, with its mask as uncompressed RLE where it has one."""
-    write_json(path, [_entry(d) for d in detections if d.defect is None])
+    """Write all detections without a defect; masks as uncompressed RLE."""
+    write_json(path, [_format_detection(d) for d in detections if d.defect is None])
 
 
-def _entry(d: Detection) -> dict[str, Any]:
+def _format_detection(d: Detection) -> dict[str, Any]:
     x0, y0, x1, y1 = d.bbox_xyxy
     entry = {
         "scene_id": d.scene_id,

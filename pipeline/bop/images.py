@@ -14,9 +14,9 @@ from pipeline.io.files import IMAGE_FORMATS
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """8-bit rgb, upright as EXIF says.
+    """8-bit rgb, rotated upright by its EXIF orientation.
 
-    Grey gives three equal channels; 16-bit grey is scaled so that 65535 becomes 255; alpha is dropped.
+    Grey images become three equal channels; 16-bit grey is scaled so that 65535 becomes 255; alpha is dropped.
     """
     with _open(path) as image:
         if image.mode.startswith("I"):
@@ -26,7 +26,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """True where the file is not black; a mask drawn in the alpha channel alone counts too."""
+    """True where the image is not black, or where it is opaque if the mask is drawn in the alpha channel only."""
     with _open(path) as image:
         values = np.asarray(image.convert("RGBA") if image.mode in ("P", "PA", "LA", "RGBA") else image)
     values = values.reshape(*values.shape[:2], -1)
@@ -62,14 +62,14 @@ _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 def image_size(path: Path) -> tuple[int, int]:
     """(h, w) of the upright image, from the file's header; the pixels are not read."""
     try:
-        with _header(path) as image:
-            on_side = _orientation(image) in (5, 6, 7, 8)
-            return (image.width, image.height) if on_side else (image.height, image.width)
+        with _open_header(path) as image:
+            rotated_by_90 = _read_orientation(image) in (5, 6, 7, 8)
+            return (image.width, image.height) if rotated_by_90 else (image.height, image.width)
     except _BROKEN as error:
-        raise _unreadable(path, error) from None
+        raise _unreadable_image(path, error) from None
 
 
-def _header(path: Path) -> PIL.Image.Image:
+def _open_header(path: Path) -> PIL.Image.Image:
     if path.exists() and not path.is_file():
         raise OSError("not a regular file")
     return PIL.Image.open(path, formats=IMAGE_FORMATS)
@@ -77,30 +77,30 @@ def _header(path: Path) -> PIL.Image.Image:
 
 def _open(path: Path) -> PIL.Image.Image:
     try:
-        image = _header(path)
+        image = _open_header(path)
         image.load()  # PIL notices a truncated file only when it reads the pixels
     except _BROKEN as error:
-        raise _unreadable(path, error) from None
-    turn = _UPRIGHT.get(_orientation(image))
-    return image if turn is None else image.transpose(turn)
+        raise _unreadable_image(path, error) from None
+    operation = _UPRIGHT.get(_read_orientation(image))
+    return image if operation is None else image.transpose(operation)
 
 
-def _orientation(image: PIL.Image.Image) -> int:
-    """EXIF's, 1 where there is none: how cameras say that they were held on their side (cv2.imread turns by it too).
+def _read_orientation(image: PIL.Image.Image) -> int:
+    """EXIF orientation (1 to 8), 1 without one; cv2.imread applies it too.
 
-    PNG files are not asked, for whom PIL would read all pixels first, and TIFF files PIL turns by itself.
+    Ignored for PNG, where PIL would have to read all pixels first, and for TIFF, which PIL rotates itself.
     """
     if image.format not in ("JPEG", "MPO", "WEBP"):
         return 1
     try:
         found = image.getexif().get(_ORIENTATION_TAG, 1)
-    except (*_BROKEN, KeyError, TypeError, struct.error, OverflowError):  # a photograph all the same
+    except (*_BROKEN, KeyError, TypeError, struct.error, OverflowError):  # broken EXIF; the pixels may be fine
         return 1
     return found if isinstance(found, int) else 1
 
 
-def _unreadable(path: Path, error: Exception) -> BadInput:
+def _unreadable_image(path: Path, error: Exception) -> BadInput:
     if isinstance(error, FileNotFoundError):
         return BadInput(path, found="no such file", needed="an image")
-    found = "no image format known" if isinstance(error, PIL.UnidentifiedImageError) else str(error)
+    found = "unknown image format" if isinstance(error, PIL.UnidentifiedImageError) else str(error)
     return BadInput(path, found=f"a broken image ({found})", needed="a complete PNG, JPEG, TIFF or WebP")

@@ -19,12 +19,12 @@ from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
 
 MAX_SYMMETRY_STEP = 0.01
-"""Largest move of a vertex between neighbouring discretised symmetries, as a share of the diameter (BOP)."""
+"""Largest displacement of a vertex between neighbouring discretised symmetries, as a fraction of the diameter (BOP)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelInfo:
-    """An entry of models_info.json, mm. ``centre``: middle of the box in the object frame, None when not given."""
+    """An entry of models_info.json, mm. ``centre``: centre of the bounding box in the object frame, None if unknown."""
 
     diameter_mm: float
     symmetries: Float[np.ndarray, "s 4 4"]
@@ -32,21 +32,19 @@ class ModelInfo:
 
 
 def read_models_info(path: Path) -> dict[int, ModelInfo]:
-    """Entries by object id; empty when there is no such file (diameters then come from the meshes)."""
+    """Entries by object id; empty if the file is missing (diameters are then measured on the meshes)."""
     if not path.exists():
         return {}
-    return {
-        obj_id: _model_info(record, describe_place(path, object=obj_id)) for obj_id, record in read_by_id(path).items()
-    }
+    records = read_by_id(path).items()
+    return {obj_id: _parse_model_info(record, describe_place(path, object=obj_id)) for obj_id, record in records}
 
 
 def read_model(
     path: Path, obj_id: int, infos: dict[int, ModelInfo], *, distances_mm: Sequence[float] = ()
 ) -> ObjectModel:
-    """The object of a mesh file. ``distances_mm``: how far from the camera it was annotated, to notice wrong units.
+    """The object of a mesh file. ``distances_mm``: its annotated distances to the camera, to detect wrong units.
 
-    Raises BadInput for a mesh without an entry in models_info.json (when there is one), and for lengths that
-    do not fit one another.
+    Raises BadInput for a mesh that models_info.json (if it exists) does not list, and for inconsistent lengths.
     """
     check_model_files(path, obj_id, infos)
     mesh = read_mesh(path)
@@ -56,13 +54,13 @@ def read_model(
         metres = " (it looks like metres)" if 500 < info.diameter_mm / measured < 2000 else ""
         found = f"a mesh of diameter {measured:.4g}{metres} where models_info.json says {info.diameter_mm:.4g}"
         raise BadInput(path, found=found, needed="vertices in millimetres and the diameter of this mesh")
-    if fault := _unit_fault(measured, distances_mm):
+    if fault := _describe_unit_fault(measured, distances_mm):
         raise BadInput(path, found=fault, needed="mesh and cam_t_m2c both in millimetres")
     return ObjectModel(obj_id, mesh, info.diameter_mm, info.symmetries) if info else ObjectModel(obj_id, mesh, measured)
 
 
 def check_model_files(path: Path, obj_id: int, infos: dict[int, ModelInfo]) -> None:
-    """Raise BadInput when an object has no mesh file, or no entry in a models_info.json that exists."""
+    """Raise BadInput for an object without a mesh file, or that models_info.json (if it exists) does not list."""
     if not path.exists():
         raise BadInput(path, found="no such file", needed=f"the mesh of object {obj_id}, which the targets ask for")
     if infos and obj_id not in infos:
@@ -77,24 +75,26 @@ def symmetry_transforms(
 ) -> Float[np.ndarray, "s 4 4"]:
     """All symmetries T_obj_obj (mm), the identity first.
 
-    As bop_toolkit's get_symmetry_transformations with max_sym_disc_step = 0.01: every continuous one in
-    ceil(pi / 0.01) = 315 rotations about its axis, each applied after the identity and every discrete one.
+    As bop_toolkit's get_symmetry_transformations with max_sym_disc_step = 0.01: each continuous symmetry becomes
+    ceil(pi / 0.01) = 315 rotations about its axis, each composed with the identity and every discrete symmetry.
     """
-    first = np.concatenate([np.eye(4)[None], discrete])
+    base = np.concatenate([np.eye(4)[None], discrete])
     if not len(axes):
-        return first
-    turns = np.concatenate([_turns(axis, offset) for axis, offset in zip(axes, offsets, strict=True)])
-    return (turns[None] @ first[:, None]).reshape(-1, 4, 4)
+        return base
+    rotations = np.concatenate([_discretise(axis, offset) for axis, offset in zip(axes, offsets, strict=True)])
+    return (rotations[None] @ base[:, None]).reshape(-1, 4, 4)
 
 
-def _turns(axis: Float[np.ndarray, " 3"], offset: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "n 4 4"]:
+def _discretise(axis: Float[np.ndarray, " 3"], offset: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "n 4 4"]:
+    """Equally spaced rotations about an axis through ``offset`` (mm), the identity first."""
     count = int(np.ceil(np.pi / MAX_SYMMETRY_STEP))
     angles = 2 * np.pi / count * np.arange(count)
     R = Rotation.from_rotvec(angles[:, None] * axis / np.linalg.norm(axis)).as_matrix()
     return rigid(R, offset - R @ offset)
 
 
-def _unit_fault(diameter: float, distances_mm: Sequence[float]) -> str:
+def _describe_unit_fault(diameter: float, distances_mm: Sequence[float]) -> str:
+    """Why the mesh or its distances cannot be in mm, "" if they can."""
     if diameter < 1:
         return f"a diameter of {diameter:.3g} (it looks like metres)"
     if not distances_mm:
@@ -107,41 +107,50 @@ def _unit_fault(diameter: float, distances_mm: Sequence[float]) -> str:
     return ""
 
 
-def _model_info(record: Any, where: str) -> ModelInfo:
+def _parse_model_info(record: Any, where: str) -> ModelInfo:
     diameter = get_field(record, "diameter", where)
     if not (is_number(diameter) and np.isfinite(diameter) and diameter > 0):
         raise BadInput(f"{where}, field diameter", found=abbreviate(diameter), needed="a number > 0, in mm")
-    given = enumerate(_list(record, "symmetries_discrete", where))
-    discrete = [_discrete(value, f"{where}, symmetries_discrete {i}") for i, value in given]
-    continuous = _list(record, "symmetries_continuous", where)
-    inside = [f"{where}, symmetries_continuous {i}" for i in range(len(continuous))]
-    axes = [get_numbers(symmetry, "axis", 3, place_) for symmetry, place_ in zip(continuous, inside, strict=True)]
-    offsets = [get_numbers(symmetry, "offset", 3, place_) for symmetry, place_ in zip(continuous, inside, strict=True)]
-    for axis, place_ in zip(axes, inside, strict=True):
-        if not axis.any():
-            raise BadInput(f"{place_}, field axis", found="a zero vector", needed="a direction")
+    discrete = [
+        _parse_discrete(value, f"{where}, symmetries_discrete {i}")
+        for i, value in enumerate(_get_list(record, "symmetries_discrete", where))
+    ]
+    axes, offsets = [], []
+    for i, symmetry in enumerate(_get_list(record, "symmetries_continuous", where)):
+        axis, offset = _parse_continuous(symmetry, f"{where}, symmetries_continuous {i}")
+        axes.append(axis)
+        offsets.append(offset)
     arrays = np.reshape(discrete, (-1, 4, 4)), np.reshape(axes, (-1, 3)), np.reshape(offsets, (-1, 3))
-    return ModelInfo(float(diameter), symmetry_transforms(*arrays), _centre(record, where))
+    return ModelInfo(float(diameter), symmetry_transforms(*arrays), _parse_centre(record, where))
 
 
-def _discrete(value: Any, where: str) -> Float[np.ndarray, "4 4"]:
+def _parse_discrete(value: Any, where: str) -> Float[np.ndarray, "4 4"]:
     T = parse_vector(value, 16, where).reshape(4, 4)
-    fault = describe_rotation_fault(T[:3, :3]) or (
-        "" if np.allclose(T[3], [0, 0, 0, 1]) else f"a last row of {T[3].tolist()}"
-    )
+    fault = describe_rotation_fault(T[:3, :3])
+    if not fault and not np.allclose(T[3], [0, 0, 0, 1]):
+        fault = f"a last row of {T[3].tolist()}"
     if fault:
         raise BadInput(where, found=fault, needed="a rigid 4 x 4 matrix, row by row")
     return T
 
 
-def _list(record: Any, field: str, where: str) -> list[Any]:
+def _parse_continuous(record: Any, where: str) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Axis and offset (mm) of a continuous symmetry."""
+    axis, offset = get_numbers(record, "axis", 3, where), get_numbers(record, "offset", 3, where)
+    if not axis.any():
+        raise BadInput(f"{where}, field axis", found="a zero vector", needed="a direction")
+    return axis, offset
+
+
+def _get_list(record: Any, field: str, where: str) -> list[Any]:
     value = record.get(field, [])
     if not isinstance(value, list):
         raise BadInput(f"{where}, field {field}", found=abbreviate(value), needed="a list")
     return value
 
 
-def _centre(record: Any, where: str) -> Float[np.ndarray, " 3"] | None:
+def _parse_centre(record: Any, where: str) -> Float[np.ndarray, " 3"] | None:
+    """Centre of the bounding box min_x .. size_z, None if it is not given."""
     names = [f"{kind}_{axis}" for kind in ("min", "size") for axis in "xyz"]
     if not all(name in record for name in names):
         return None

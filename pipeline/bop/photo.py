@@ -1,4 +1,4 @@
-"""One's own meshes, photograph, camera and perhaps a mask or box -> a dataset of one image."""
+"""Your own meshes, photograph, camera and optionally a mask or box -> a dataset of one image."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from pipeline.items.views import Image, Target
 from pipeline.spec import PositiveFloat, Spec, digest, spec
 
 SCENE_ID, IM_ID = 0, 0
-_SMALLEST_MM = 2.0
+_MIN_DIAMETER_MM = 2.0
 
 
 @spec
 class PhotoConfig(Spec):
-    """A mesh, a photograph, K, and where the object is: a mask, or a box, or neither for a detector that finds it.
+    """A mesh, a photograph, K, and the object's location: a mask, a box, or neither if a detector is to find it.
 
-    ``mesh``: one file, or several for a detector that finds them all; they are objects 1, 2, ... in that order.
-    ``K``: fx, fy, cx, cy or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height of its pixels.
-    ``scale`` multiplies the mesh's vertices, 1000 for a mesh in metres.
+    ``mesh``: one file, or several for a detector; they become objects 1, 2, ... in this order. ``K``: fx, fy, cx, cy
+    or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height in pixels. ``scale`` multiplies the
+    mesh's vertices: 1000 for a mesh in metres.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -55,9 +55,9 @@ class PhotoConfig(Spec):
             )
         meshes = (self.mesh,) if isinstance(self.mesh, str) else self.mesh
         if not meshes or (len(meshes) > 1 and (self.mask or self.bbox)):
-            found = f"{len(meshes)} meshes" + (" and where one object is" if meshes else "")
+            found = f"{len(meshes)} meshes" + (" and the location of one object" if meshes else "")
             raise BadInput(
-                "dataset.mesh", found=found, needed="one mesh; several go without dataset.mask and dataset.bbox"
+                "dataset.mesh", found=found, needed="one mesh, or several without dataset.mask and dataset.bbox"
             )
         if self.bbox is not None and not np.isfinite(self.bbox).all():
             raise BadInput("dataset.bbox", found=list(self.bbox), needed="four finite numbers: x, y, width, height")
@@ -91,7 +91,10 @@ class PhotoConfig(Spec):
 
 
 def _check_principal_point(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> None:
-    """Without annotations, only a principal point far outside tells the K of another image."""
+    """Raise BadInput for a principal point far outside the image: K probably belongs to another image size.
+
+    Without annotations nothing else can reveal this.
+    """
     (h, w), (cx, cy) = size_hw, K[:2, 2]
     if not (-w <= cx <= 2 * w and -h <= cy <= 2 * h):
         found = f"principal point ({cx:g}, {cy:g}) for an image of {w} x {h} (width x height)"
@@ -111,12 +114,12 @@ class Photo(Dataset):
 
     @property
     def location_field(self) -> str:
-        """As Dataset.location_field."""
+        """``dataset.mask`` or ``dataset.bbox``, "" without either."""
         return "dataset.mask" if self.mask_file else "dataset.bbox" if self.bbox_xyxy else ""
 
     @property
     def given_bbox_xyxy(self) -> Box | None:
-        """The box, when there is one instead of a mask."""
+        """The box, if one is given instead of a mask."""
         return self.bbox_xyxy
 
     def image(self, scene_id: int, im_id: int) -> Image:
@@ -124,15 +127,15 @@ class Photo(Dataset):
         return Image(scene_id, im_id, read_rgb(self.photo_path), self.camera_matrix)
 
     def image_path(self, scene_id: int, im_id: int) -> Path:
-        """Its file."""
+        """The photograph's file."""
         return self.photo_path
 
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
-        """Its camera matrix."""
+        """The photograph's camera matrix, px."""
         return self.camera_matrix
 
     def has_ground_truth(self, scene_id: int) -> bool:
-        """No."""
+        """False: a photograph has no ground truth."""
         return False
 
     def model_path(self, obj_id: int, *, folder: str | None = None) -> Path:
@@ -140,20 +143,20 @@ class Photo(Dataset):
         return self.mesh_paths[obj_id - 1]
 
     def mesh_digest(self, obj_id: int) -> str:
-        """Digest of an object's mesh, scaled."""
-        return self._scaled(super().mesh_digest(obj_id))
+        """Digest of an object's mesh after scaling."""
+        return self._digest_after_scaling(super().mesh_digest(obj_id))
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
-        """An object's mesh, scaled. Raises BadInput for one too small to be in millimetres."""
+        """An object with its mesh scaled. Raises BadInput for a mesh too small to be in millimetres."""
         path = self.model_path(obj_id)
         mesh = read_mesh(path)
-        mesh = replace(mesh, vertices=mesh.vertices * self.scale, digest=self._scaled(mesh.digest))
+        mesh = replace(mesh, vertices=mesh.vertices * self.scale, digest=self._digest_after_scaling(mesh.digest))
         diameter = diameter_mm(mesh)
-        if diameter < _SMALLEST_MM:
+        if diameter < _MIN_DIAMETER_MM:
             found = f"a mesh of diameter {diameter:.3g} (it looks like metres)"
             raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
         return ObjectModel(obj_id, mesh, diameter)
 
-    def _scaled(self, mesh: str) -> str:
-        """Digest of a mesh once it is scaled."""
+    def _digest_after_scaling(self, mesh: str) -> str:
+        """Digest of a mesh after scaling, from the digest of its file."""
         return mesh if self.scale == 1.0 else digest([mesh, self.scale])

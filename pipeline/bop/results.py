@@ -19,12 +19,12 @@ from pipeline.items.poses import PoseEstimate
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _HEADER = ",".join(COLUMNS)
-_SAME_TIME_S = 1e-3  # bop_toolkit lets the times of one image differ by as much
+_TIME_TOLERANCE_S = 1e-3  # largest difference between the times of one image that bop_toolkit accepts
 
 
 @dataclass(frozen=True, eq=False)
 class ResultRow:
-    """One estimated pose, mm. ``time_s``: seconds the whole image took, the same in all its rows; -1 unknown."""
+    """One estimated pose, mm. ``time_s``: seconds spent on the whole image, equal in all its rows; -1: unknown."""
 
     scene_id: int
     im_id: int
@@ -35,9 +35,9 @@ class ResultRow:
 
 
 def results_name(method: str, dataset: str, split: str = "test") -> str:
-    """The file name BOP asks for, ``<method>_<dataset>-<split>.csv``; a split's sensor ("test_primesense") is left out.
+    """BOP's file name, ``<method>_<dataset>-<split>.csv``, without the split's sensor ("test_primesense" -> "test").
 
-    Raises BadInput for names with an underscore: BOP's tools split the file name there.
+    Raises BadInput for names with an underscore, where BOP's tools split the file name.
     """
     for field, name in (("method", method), ("dataset", dataset)):
         if not name or any(c in "_/\\ \t\n" for c in name):
@@ -50,7 +50,7 @@ def results_name(method: str, dataset: str, split: str = "test") -> str:
 def parse_results_name(path: Path) -> tuple[str, str, str] | None:
     """(method, dataset, split) of ``<method>_<dataset>-<split>.csv``, None for another name.
 
-    As BOP's tools read it: what follows the last part of the split, after a further underscore, is left out.
+    As in BOP's tools, anything after a further underscore is ignored.
     """
     found = re.fullmatch(r"([^_]+)_([^_-]+)-([^_]+)(?:_.*)?", path.stem)
     return (found[1], found[2], found[3]) if found and path.suffix == ".csv" else None
@@ -59,9 +59,9 @@ def parse_results_name(path: Path) -> tuple[str, str, str] | None:
 def make_rows(
     estimates: Sequence[PoseEstimate], times_by_image: Mapping[tuple[int, int], float] | None = None
 ) -> list[ResultRow]:
-    """Rows of estimates, sorted by scene, image and object, best score first.
+    """One row per estimate, sorted by scene, image, object and descending score.
 
-    ``times_by_image``: seconds by (scene_id, im_id), -1 (unknown) where it has no entry.
+    ``times_by_image``: seconds by (scene_id, im_id); images without an entry get -1 (unknown).
     """
     times = times_by_image or {}
     rows = [
@@ -72,12 +72,12 @@ def make_rows(
 
 
 def write_results(path: Path, rows: Iterable[ResultRow]) -> None:
-    """Write the csv; a reader sees the whole file or none. Numbers are written so that they read back the same."""
-    write_atomic(path, "\n".join([_HEADER, *map(_line, rows), ""]).encode("ascii"))
+    """Write the csv atomically. Floats are written with ``repr``, so that reading them returns the same values."""
+    write_atomic(path, "\n".join([_HEADER, *map(_format_row, rows), ""]).encode("ascii"))
 
 
 def read_results(path: Path) -> list[ResultRow]:
-    """Rows in file order. Raises BadInput naming line and field for the first fault; the header line may be missing."""
+    """Rows in file order; the header line is optional. Raises BadInput, with line and field, at the first fault."""
     rows, faults = scan_results(path)
     if faults:
         raise faults[0]
@@ -85,7 +85,7 @@ def read_results(path: Path) -> list[ResultRow]:
 
 
 def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
-    """All good rows in file order, and what is wrong with the others. Raises BadInput for an unreadable file."""
+    """All valid rows in file order, and the faults of the others. Raises BadInput for an unreadable file."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except FileNotFoundError:
@@ -93,7 +93,7 @@ def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
     except OSError as error:
         raise BadInput(path, found=error, needed="a BOP results csv") from None
     except UnicodeDecodeError:
-        raise BadInput(path, found="bytes that are no text", needed="a BOP results csv") from None
+        raise BadInput(path, found="bytes that are not text", needed="a BOP results csv") from None
     rows: list[ResultRow] = []
     faults: list[BadInput] = []
     times: dict[tuple[int, int], float] = {}
@@ -101,7 +101,7 @@ def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
         if not line.strip() or (number == 1 and [c.strip() for c in line.split(",")] == list(COLUMNS)):
             continue
         try:
-            row = _row(line, f"{path}, line {number}")
+            row = _parse_row(line, f"{path}, line {number}")
             _check_time(row, times, f"{path}, line {number}")
         except BadInput as fault:
             faults.append(fault)
@@ -111,26 +111,27 @@ def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
 
 
 def _check_time(row: ResultRow, times: dict[tuple[int, int], float], where: str) -> None:
+    """Raise BadInput if the row's time differs from that of earlier rows of its image, kept in ``times``."""
     known = times.setdefault((row.scene_id, row.im_id), row.time_s)
-    if abs(known - row.time_s) > _SAME_TIME_S:
+    if abs(known - row.time_s) > _TIME_TOLERANCE_S:
         found = f"{row.time_s:g} after {known:g} for scene {row.scene_id}, image {row.im_id}"
         raise BadInput(f"{where}, field time", found=found, needed="one time for all rows of an image")
 
 
-def _line(row: ResultRow) -> str:
+def _format_row(row: ResultRow) -> str:
     R, t = row.T_cam_obj[:3, :3].ravel(), row.T_cam_obj[:3, 3]
     texts = [" ".join(repr(float(v)) for v in values) for values in (R, t)]
     ids = [row.scene_id, row.im_id, row.obj_id]
     return ",".join([*map(str, ids), repr(float(row.score)), *texts, repr(float(row.time_s))])
 
 
-def _row(line: str, where: str) -> ResultRow:
+def _parse_row(line: str, where: str) -> ResultRow:
     cells = line.split(",")
     if len(cells) != len(COLUMNS):
         raise BadInput(where, found=f"{len(cells)} columns", needed=f"{len(COLUMNS)}: {_HEADER}")
-    ids = [_id(cell, f"{where}, field {name}") for name, cell in zip(COLUMNS, cells[:3], strict=False)]
+    ids = [_parse_id(cell, f"{where}, field {name}") for name, cell in zip(COLUMNS, cells[:3], strict=False)]
     score, R, t, time_s = (
-        _numbers(cell, count, f"{where}, field {name}")
+        _parse_numbers(cell, count, f"{where}, field {name}")
         for name, cell, count in zip(COLUMNS[3:], cells[3:], (1, 9, 3, 1), strict=True)
     )
     if fault := describe_rotation_fault(R.reshape(3, 3)):
@@ -140,7 +141,7 @@ def _row(line: str, where: str) -> ResultRow:
     return ResultRow(ids[0], ids[1], ids[2], float(score[0]), rigid(R.reshape(3, 3), t), float(time_s[0]))
 
 
-def _id(cell: str, where: str) -> int:
+def _parse_id(cell: str, where: str) -> int:
     try:
         value = int(cell)
     except ValueError:
@@ -150,7 +151,7 @@ def _id(cell: str, where: str) -> int:
     return value
 
 
-def _numbers(cell: str, count: int, where: str) -> Float[np.ndarray, " n"]:
+def _parse_numbers(cell: str, count: int, where: str) -> Float[np.ndarray, " n"]:
     needed = f"{count} finite numbers, separated by spaces" if count > 1 else "a finite number"
     try:
         values = [float(part) for part in cell.split()]

@@ -1,4 +1,4 @@
-"""One scene's folder: cameras, ground truth and the files of its images, each checked when it is asked for."""
+"""One scene's folder: cameras, ground truth and image files, each validated when it is first needed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_integ
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 
-# LM-O publishes rotations that are orthonormal to 1e-2 only; results rounded to three decimals are off by 2e-3.
+# Largest entry of |R R^T - I|. LM-O's published rotations reach 1e-2; rounding to three decimals gives 2e-3.
 ROTATION_TOLERANCE = 2e-2
 _IMAGE_FILES = ("rgb/{:06d}.png", "rgb/{:06d}.jpg", "gray/{:06d}.png", "gray/{:06d}.tif", "gray/{:06d}.jpg")
 _DEPTH_FILES = ("depth/{:06d}.png", "depth/{:06d}.tif")
@@ -25,7 +25,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A photograph's camera. ``depth_scale``: mm per unit of the depth image, None when the file does not say."""
+    """An image's camera matrix, px. ``depth_scale``: mm per unit of the depth image, None if unknown."""
 
     K: Float[np.ndarray, "3 3"]
     depth_scale: float | None
@@ -33,10 +33,10 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """An annotated instance. ``gt_id``: its index in scene_gt.json; the rotation is kept as published.
+    """An annotated instance. ``gt_id``: its index in scene_gt.json. Rotations are kept as published.
 
-    Boxes are edges in pixels (x0, y0, x1, y1), of the visible part and of the whole silhouette; they and
-    ``visib_fract`` are None without scene_gt_info.json, and a box is None for an instance that is not in the image.
+    Boxes (x0, y0, x1, y1) are edges in pixels, of the visible part and of the full silhouette. They and ``visib_fract``
+    are None without scene_gt_info.json; a box is also None for an instance outside the image.
     """
 
     gt_id: int
@@ -56,34 +56,34 @@ class Scene:
 
     @cached_property
     def cameras(self) -> dict[int, Any]:
-        """scene_camera.json by image, unchecked."""
+        """scene_camera.json by image, not validated."""
         return read_by_id(self.folder / "scene_camera.json")
 
     @cached_property
     def annotations(self) -> dict[int, Any]:
-        """scene_gt.json by image, unchecked."""
+        """scene_gt.json by image, not validated."""
         return read_by_id(self.folder / "scene_gt.json")
 
     @cached_property
     def annotation_infos(self) -> dict[int, Any]:
-        """scene_gt_info.json by image, unchecked; empty without the file."""
+        """scene_gt_info.json by image, not validated; empty without the file."""
         path = self.folder / "scene_gt_info.json"
         return read_by_id(path) if path.exists() else {}
 
     def image_path(self, im_id: int) -> Path:
-        """The photograph: rgb/ before gray/, png before jpg and tif."""
-        return self._first(_IMAGE_FILES, im_id, "an image")
+        """The image's file: rgb/ is preferred to gray/, png to jpg and tif. Raises BadInput."""
+        return self._find_file(_IMAGE_FILES, im_id, "an image")
 
     def depth_path(self, im_id: int) -> Path:
-        """The depth image."""
-        return self._first(_DEPTH_FILES, im_id, "a depth image")
+        """The depth image's file. Raises BadInput."""
+        return self._find_file(_DEPTH_FILES, im_id, "a depth image")
 
     def mask_path(self, im_id: int, gt_id: int, *, visible: bool) -> Path:
-        """Mask of one annotated instance, its visible part or its whole silhouette. The file may be missing."""
+        """File of an instance's mask, visible part or full silhouette. The file may be missing."""
         return self.folder / ("mask_visib" if visible else "mask") / f"{im_id:06d}_{gt_id:06d}.png"
 
     def camera(self, im_id: int) -> Camera:
-        """K and depth scale of one image."""
+        """K and depth scale of one image. Raises BadInput."""
         path = self.folder / "scene_camera.json"
         where = describe_place(path, scene=self.scene_id, image=im_id)
         if im_id not in self.cameras:
@@ -96,79 +96,74 @@ class Scene:
         return Camera(K, None if scale is None else float(scale))
 
     def ground_truth(self, im_id: int) -> list[GroundTruth]:
-        """Annotated instances of one image. Raises BadInput when there is no annotation or a pose is impossible."""
+        """Annotated instances of one image. Raises BadInput for a missing annotation or an impossible pose."""
         if im_id not in self._ground_truth:
-            self._ground_truth[im_id] = self._parsed(im_id)
+            self._ground_truth[im_id] = self._parse_ground_truth(im_id)
         return list(self._ground_truth[im_id])
 
     @cached_property
     def _ground_truth(self) -> dict[int, list[GroundTruth]]:
-        """By image, parsed once: every step asks for it again. A dict, as a scene travels to workers."""
+        """Parsed instances by image, since every step needs them. A plain dict, so that workers can unpickle it."""
         return {}
 
-    def _parsed(self, im_id: int) -> list[GroundTruth]:
+    def _parse_ground_truth(self, im_id: int) -> list[GroundTruth]:
         path = self.folder / "scene_gt.json"
         where = describe_place(path, scene=self.scene_id, image=im_id)
         records = self.annotations.get(im_id)
         if not isinstance(records, list):
             found = "no entry" if records is None else abbreviate(records)
             raise BadInput(where, found=found, needed="the list of annotated instances")
-        infos = self._infos(im_id, len(records))
+        infos = self._get_infos(im_id, len(records))
         pairs = enumerate(zip(records, infos, strict=True))
-        return [_instance(record, info, gt_id, f"{where}, instance {gt_id}") for gt_id, (record, info) in pairs]
+        return [_parse_instance(record, info, gt_id, f"{where}, instance {gt_id}") for gt_id, (record, info) in pairs]
 
-    def _infos(self, im_id: int, count: int) -> list[Any]:
+    def _get_infos(self, im_id: int, count: int) -> list[Any]:
+        """The image's entries of scene_gt_info.json; ``count`` times None without the file. Raises BadInput."""
         if not self.annotation_infos:
             return [None] * count
         infos = self.annotation_infos.get(im_id)
         if not isinstance(infos, list) or len(infos) != count:
             where = describe_place(self.folder / "scene_gt_info.json", scene=self.scene_id, image=im_id)
-            found = (
-                "no entry"
-                if infos is None
-                else f"{len(infos)} entries"
-                if isinstance(infos, list)
-                else abbreviate(infos)
-            )
+            found = f"{len(infos)} entries" if isinstance(infos, list) else abbreviate(infos)
+            found = "no entry" if infos is None else found
             raise BadInput(where, found=found, needed=f"{count} entries, as many as scene_gt.json has")
         return infos
 
-    def _first(self, patterns: tuple[str, ...], im_id: int, what: str) -> Path:
+    def _find_file(self, patterns: tuple[str, ...], im_id: int, what: str) -> Path:
         candidates = [self.folder / pattern.format(im_id) for pattern in patterns]
         for path in candidates:
             if path.exists():
                 return path
         where = describe_place(self.folder, scene=self.scene_id, image=im_id)
-        raise BadInput(
-            where, found="no file", needed=f"{what} at one of {', '.join(p.format(im_id) for p in patterns)}"
-        )
+        names = ", ".join(pattern.format(im_id) for pattern in patterns)
+        raise BadInput(where, found="no file", needed=f"{what} at one of {names}")
 
 
 def xyxy_from_xywh(bbox_xywh: Sequence[float]) -> Box:
-    """(x0, y0, x1, y1) of BOP's box (x, y, w, h), whose columns are x to x + w - 1."""
+    """Edges (x0, y0, x1, y1) of BOP's box (x, y, w, h), which covers the pixel columns x to x + w - 1."""
     x, y, w, h = bbox_xywh
     return x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5
 
 
 def describe_rotation_fault(R: Float[np.ndarray, "3 3"]) -> str:
-    """Why R is no rotation, "" when it is one within ROTATION_TOLERANCE."""
-    off = float(np.abs(R @ R.T - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE:
-        return f"a matrix whose R R^T is off the identity by {off:.3g}"
+    """Why R is not a rotation within ROTATION_TOLERANCE, "" if it is."""
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE:
+        return f"a matrix whose R R^T differs from the identity by {error:.3g}"
     return "" if np.linalg.det(R) > 0 else "a reflection (determinant -1)"
 
 
 def check_K(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], where: str) -> None:
-    """Raise BadInput for a K that no pinhole camera with an image of this size can have.
+    """Raise BadInput for a K that is implausible for a pinhole camera with an image of this size.
 
-    Cropped images are legitimate: their principal point may lie outside, but not so far that the whole image is more
-    than 45 degrees off the optical axis. A field of view above 157 or below 0.6 degrees is a K in other units.
+    The principal point may lie outside the image, as in cropped images, but not so far that the whole image is more
+    than 45 degrees off the optical axis. A field of view above 157 or below 0.6 degrees means that K has other units.
     """
     h, w = size_hw
     (fx, skew, cx), (zero, fy, cy) = K[:2]
     if np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(zero) > 1e-6:
         raise BadInput(where, found=f"rows {K[1].tolist()}, {K[2].tolist()}", needed="K = [fx 0 cx; 0 fy cy; 0 0 1]")
-    if abs(skew) > 0.1:  # pixels at 45 degrees off the axis; the solvers ignore skew
+    if abs(skew) > 0.1:  # px of displacement at 45 degrees off the axis; the solvers ignore skew
         raise BadInput(where, found=f"a skew of {skew:g}", needed="a K without skew: undistort the images first")
     longer = max(h, w)
     if not (0.1 * longer < fx < 100 * longer and 0.1 * longer < fy < 100 * longer):
@@ -179,7 +174,7 @@ def check_K(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], where: str) -
         raise BadInput(where, found=f"cx {cx:g}, cy {cy:g}", needed=needed)
 
 
-def _instance(record: Any, info: Any, gt_id: int, where: str) -> GroundTruth:
+def _parse_instance(record: Any, info: Any, gt_id: int, where: str) -> GroundTruth:
     R = get_numbers(record, "cam_R_m2c", 9, where).reshape(3, 3)
     t = get_numbers(record, "cam_t_m2c", 3, where)
     if fault := describe_rotation_fault(R):
@@ -195,11 +190,12 @@ def _instance(record: Any, info: Any, gt_id: int, where: str) -> GroundTruth:
     visible = get_field(info, "visib_fract", where)
     if not (is_number(visible) and 0 <= visible <= 1):
         raise BadInput(f"{where}, field visib_fract", found=abbreviate(visible), needed="a number from 0 to 1")
-    return GroundTruth(gt_id, *pose, float(visible), _box(info, "bbox_visib", where), _box(info, "bbox_obj", where))
+    return GroundTruth(
+        gt_id, *pose, float(visible), _parse_box(info, "bbox_visib", where), _parse_box(info, "bbox_obj", where)
+    )
 
 
-def _box(info: Any, field: str, where: str) -> Box | None:
+def _parse_box(info: Any, field: str, where: str) -> Box | None:
     box = get_numbers(info, field, 4, where).tolist()
-    return (
-        xyxy_from_xywh(box) if box[2] > 0 and box[3] > 0 else None
-    )  # BOP writes -1 -1 -1 -1 for an instance not in sight
+    is_visible = box[2] > 0 and box[3] > 0  # BOP writes -1 -1 -1 -1 for an instance outside the image
+    return xyxy_from_xywh(box) if is_visible else None

@@ -108,9 +108,9 @@ def scores_to_record(scores: Scores) -> dict[str, Any]:
     return {
         "instances": scores.instances(),
         "visib_fract": visible,
-        "mssd": _hex(scores.mssd),
-        "mspd": _hex(scores.mspd),
-        "vsd": None if scores.vsd is None else _hex(scores.vsd.reshape(len(scores), 100)),
+        "mssd": _to_hex(scores.mssd),
+        "mspd": _to_hex(scores.mspd),
+        "vsd": None if scores.vsd is None else _to_hex(scores.vsd.reshape(len(scores), 100)),
         "no_vsd": scores.no_vsd,
     }
 
@@ -121,8 +121,8 @@ def scores_from_record(record: Mapping[str, Any]) -> Scores:
     visible = np.array([np.nan if v is None else v for v in record["visib_fract"]], dtype=np.float64)
     if not {len(record[name]) for name in ("visib_fract", "mssd", "mspd")} <= {len(scene_id)}:
         raise ValueError("scores of another number of instances")
-    mssd, mspd = _bits(record["mssd"], 10), _bits(record["mspd"], 10)
-    vsd = None if record["vsd"] is None else _bits(record["vsd"], 100).reshape(len(scene_id), 10, 10)
+    mssd, mspd = _from_hex(record["mssd"], 10), _from_hex(record["mspd"], 10)
+    vsd = None if record["vsd"] is None else _from_hex(record["vsd"], 100).reshape(len(scene_id), 10, 10)
     return Scores(scene_id, im_id, obj_id, gt_id, visible, mssd, mspd, vsd, record["no_vsd"])
 
 
@@ -139,10 +139,10 @@ def errors_from_record(record: Mapping[str, Any]) -> PoseErrors:
     return PoseErrors(**values)
 
 
-def _hex(bits: Bool[np.ndarray, "n k"]) -> list[str]:
+def _to_hex(bits: Bool[np.ndarray, "n k"]) -> list[str]:
     return [np.packbits(row).tobytes().hex() for row in bits]
 
 
-def _bits(rows: Sequence[str], count: int) -> Bool[np.ndarray, "n k"]:
+def _from_hex(rows: Sequence[str], count: int) -> Bool[np.ndarray, "n k"]:
     packed = np.array([list(bytes.fromhex(row)) for row in rows], dtype=np.uint8).reshape(len(rows), (count + 7) // 8)
     return np.unpackbits(packed, axis=1, count=count).astype(bool)

@@ -1,1 +1,1 @@
-"""Errors of poses and what follows from them, as bop_toolkit defines them."""
+"""Pose errors, recalls and their confidence intervals, as defined by bop_toolkit."""

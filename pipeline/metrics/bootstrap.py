@@ -1,4 +1,4 @@
-"""values of instances -> intervals of their mean, by resampling images: targets of one image are not independent."""
+"""values of instances -> bootstrap intervals of the mean. Resamples images, whose instances are not independent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and the bounds between which it lies in LEVEL of the resamples."""
+    """A mean with its LEVEL (95 %) confidence interval."""
 
     mean: float
     low: float
@@ -22,14 +22,14 @@ class Interval:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether the interval leaves out 0: for a difference, whether it is more than chance."""
+        """Whether 0 lies outside the interval: for a difference, whether it is significant."""
         return self.low > 0 or self.high < 0
 
 
 def mean_interval(values: Float[np.ndarray, " n"], image: Int[np.ndarray, " n"]) -> Interval:
-    """Mean of ``values`` over instances with its percentile interval (Efron, 1979) over images drawn with replacement.
+    """Mean over instances with its bootstrap percentile interval (Efron, 1979), resampling whole images.
 
-    ``image``: index of each instance's image. NaN without an instance; no width with one image.
+    ``image``: index of each instance's image. NaN without instances; with one image the interval has no width.
     """
     if not len(values):
         return Interval(np.nan, np.nan, np.nan)
@@ -44,11 +44,11 @@ def mean_interval(values: Float[np.ndarray, " n"], image: Int[np.ndarray, " n"])
 def paired_interval(
     ours: Float[np.ndarray, " n"], theirs: Float[np.ndarray, " n"], image: Int[np.ndarray, " n"]
 ) -> Interval:
-    """Interval of the mean difference ``ours - theirs`` of the same instances in the same order."""
+    """Interval of the mean difference ``ours - theirs``; both list the same instances in the same order."""
     return mean_interval(ours - theirs, image)
 
 
 def image_index(scene_id: Int[np.ndarray, " n"], im_id: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """One number for each (scene_id, im_id)."""
+    """Index of each instance's image: equal for equal (scene_id, im_id), counting from 0."""
     _, index = np.unique(np.stack([scene_id, im_id], axis=1), axis=0, return_inverse=True)
     return index.reshape(-1)

@@ -1,4 +1,4 @@
-"""errors of estimates -> which estimate found which instance, as bop_toolkit matches them."""
+"""errors of estimates -> matches between estimates and annotated instances, as in bop_toolkit."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from jaxtyping import Float
 
 
 def select_best_scored(scores: Sequence[float], count: int) -> list[int]:
-    """Indices of the ``count`` estimates with the highest scores, best first; equals keep their order; 0: all."""
+    """Indices of the ``count`` highest scores, best first; ties keep their order. ``count`` 0: all."""
     order = sorted(range(len(scores)), key=lambda i: -scores[i])
     return order[:count] if count else order
 
 
 def match_instances(errors: Float[np.ndarray, "e g"], threshold: float) -> list[tuple[int, int]]:
-    """Pairs (estimate, instance) of the greedy matching: estimates, best score first, each take the nearest instance.
+    """Greedy matching as pairs (estimate, instance). Rows of ``errors`` are estimates, best score first.
 
-    Only instances that are still free and whose error is below ``threshold`` can be taken; of equals, the first.
+    Each estimate takes the free instance with the smallest error, if it is below ``threshold``; ties go to the first.
     """
-    taken: list[tuple[int, int]] = []
+    matches: list[tuple[int, int]] = []
     free = np.ones(errors.shape[1], dtype=bool)
     for est, row in enumerate(errors):
-        open_row = np.where(free, row, np.inf)
-        gt = int(np.argmin(open_row)) if open_row.size else -1
-        if gt >= 0 and open_row[gt] < threshold:
-            taken.append((est, gt))
+        free_errors = np.where(free, row, np.inf)
+        gt = int(np.argmin(free_errors)) if free_errors.size else -1
+        if gt >= 0 and free_errors[gt] < threshold:
+            matches.append((est, gt))
             free[gt] = False
-    return taken
+    return matches

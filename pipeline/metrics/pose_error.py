@@ -1,4 +1,4 @@
-"""estimated and true pose -> errors. ``T_est`` and ``T_gt`` are T_cam_obj in mm, ``vertices`` the object's, in mm."""
+"""estimated and true pose -> errors. ``T_est``, ``T_gt``: T_cam_obj, mm; ``vertices``: in the object frame, mm."""
 
 from __future__ import annotations
 
@@ -11,41 +11,41 @@ from pipeline.functional.rigid import rotation_angle_deg, transform
 
 Pose = Float[np.ndarray, "4 4"]
 Vertices = Float[np.ndarray, "v 3"]
-_BLOCK_FLOATS = 1 << 22  # coordinates held at once for the symmetries, 32 MiB
+_BLOCK_FLOATS = 1 << 22  # coordinates computed at a time for all symmetries, 32 MiB
 
 
 def rotation_error_deg(T_est: Pose, T_gt: Pose) -> float:
-    """Geodesic angle between the rotations, degrees. Symmetries are not considered.
+    """Geodesic angle between the rotations, degrees, without symmetries.
 
-    bop_toolkit's ``re`` for exact rotations; by atan2, so that LM-O's rotations, orthonormal to 1e-2 only, give no
-    spurious degrees near zero as the arc cosine would.
+    Equals bop_toolkit's ``re`` for exact rotations. It uses atan2: for LM-O's rotations, orthonormal only to 1e-2, the
+    arc cosine would give spurious degrees near zero.
     """
     return float(rotation_angle_deg(T_est[None, :3, :3], T_gt[None, :3, :3])[0])
 
 
 def translation_error_mm(T_est: Pose, T_gt: Pose) -> float:
-    """Distance of the translations, mm: bop_toolkit's ``te``."""
+    """Distance between the translations, mm; bop_toolkit's ``te``."""
     return float(np.linalg.norm(T_est[:3, 3] - T_gt[:3, 3]))
 
 
 def add(T_est: Pose, T_gt: Pose, vertices: Vertices) -> float:
-    """Mean distance of corresponding vertices, mm (Hinterstoisser et al., ACCV 2012)."""
+    """ADD: mean distance between corresponding vertices, mm (Hinterstoisser et al., ACCV 2012)."""
     return float(np.linalg.norm(transform(T_est, vertices) - transform(T_gt, vertices), axis=1).mean())
 
 
 def adi(T_est: Pose, T_gt: Pose, vertices: Vertices) -> float:
-    """Mean distance of each true vertex to the nearest estimated one, mm (Hinterstoisser et al., ACCV 2012)."""
+    """ADI: mean distance from each true vertex to the nearest estimated one, mm (Hinterstoisser et al., ACCV 2012)."""
     distances, _ = cKDTree(transform(T_est, vertices)).query(transform(T_gt, vertices))
     return float(distances.mean())
 
 
 def mssd(T_est: Pose, T_gt: Pose, vertices: Vertices, symmetries: Float[np.ndarray, "s 4 4"]) -> float:
-    """Maximum symmetry-aware surface distance, mm: over the symmetries, the least of the largest vertex distances.
+    """Maximum symmetry-aware surface distance, mm: the minimum over symmetries of the largest vertex distance.
 
-    Drost et al., ICCVW 2017; Hodan et al., ECCVW 2020, section 2.2. The distance between two placements is convex, so
-    the vertices of the convex hull (``hull_vertices``) give the same value as all of them.
+    Drost et al., ICCVW 2017; Hodan et al., ECCVW 2020, section 2.2. The distance between two poses of a point is convex
+    in the point, so the vertices of the convex hull (``hull_vertices``) give the same value as all vertices.
     """
-    return float(_largest_distance(T_est, T_gt, vertices, symmetries).min())
+    return float(_largest_distances(T_est, T_gt, vertices, symmetries).min())
 
 
 def mspd(
@@ -58,58 +58,61 @@ def mspd(
 ) -> float:
     """Maximum symmetry-aware projection distance, pixels of the image of K (Hodan et al., ECCVW 2020, section 2.2).
 
-    ``probes``: some of the vertices. Their largest distance is a lower bound for each symmetry, so that only few
-    symmetries are measured on all vertices; the value is the same.
+    ``probes``: a subset of the vertices, for speed. Their largest distance is a lower bound for each symmetry, so most
+    symmetries need not be measured on all vertices; the result is the same.
     """
-    seen = project(K, transform(T_est, vertices))
+    est_px = project(K, transform(T_est, vertices))
     if probes is None or len(symmetries) == 1:
-        return float(_largest_shift(K, seen, T_gt, vertices, symmetries).min())
-    bound = _largest_shift(K, project(K, transform(T_est, probes)), T_gt, probes, symmetries)
+        return float(_largest_shifts(K, est_px, T_gt, vertices, symmetries).min())
+    bound = _largest_shifts(K, project(K, transform(T_est, probes)), T_gt, probes, symmetries)
     best = np.inf
     for index in np.argsort(bound):
         if bound[index] >= best:
             break
-        best = min(best, float(_largest_shift(K, seen, T_gt, vertices, symmetries[index : index + 1])[0]))
+        best = min(best, float(_largest_shifts(K, est_px, T_gt, vertices, symmetries[index : index + 1])[0]))
     return best
 
 
 def hull_vertices(vertices: Vertices) -> Float[np.ndarray, "h 3"]:
-    """The vertices of the convex hull; all of them for a flat object."""
+    """Vertices of the convex hull; all vertices for a flat object."""
     try:
         return vertices[ConvexHull(vertices).vertices]
     except QhullError:
         return vertices
 
 
-def _largest_distance(
+def _largest_distances(
     T_est: Pose, T_gt: Pose, vertices: Vertices, symmetries: Float[np.ndarray, "s 4 4"]
 ) -> Float[np.ndarray, " s"]:
-    seen = transform(T_est, vertices)
-    blocks = _blocks(symmetries, len(vertices))
-    return _finite([np.linalg.norm(_placed(T_gt @ block, vertices) - seen, axis=-1).max(axis=-1) for block in blocks])
+    """Largest vertex distance for each symmetry, mm."""
+    est = transform(T_est, vertices)
+    blocks = _split_symmetries(symmetries, len(vertices))
+    placed = (_transform_all(T_gt @ block, vertices) for block in blocks)
+    return _concatenate([np.linalg.norm(gt - est, axis=-1).max(axis=-1) for gt in placed])
 
 
-def _largest_shift(
+def _largest_shifts(
     K: Float[np.ndarray, "3 3"],
-    seen_px: Float[np.ndarray, "v 2"],
+    est_px: Float[np.ndarray, "v 2"],
     T_gt: Pose,
     vertices: Vertices,
     symmetries: Float[np.ndarray, "s 4 4"],
 ) -> Float[np.ndarray, " s"]:
-    blocks = _blocks(symmetries, len(vertices))
-    placed = (project(K, _placed(T_gt @ block, vertices)) for block in blocks)
-    return _finite([np.linalg.norm(px - seen_px, axis=-1).max(axis=-1) for px in placed])
+    """Largest distance between projected vertices for each symmetry, pixels."""
+    blocks = _split_symmetries(symmetries, len(vertices))
+    placed = (project(K, _transform_all(T_gt @ block, vertices)) for block in blocks)
+    return _concatenate([np.linalg.norm(px - est_px, axis=-1).max(axis=-1) for px in placed])
 
 
-def _finite(blocks: list[Float[np.ndarray, " _b"]]) -> Float[np.ndarray, " s"]:
-    """One array; a vertex in the camera's plane, which has no projection, counts as infinitely far."""
+def _concatenate(blocks: list[Float[np.ndarray, " _b"]]) -> Float[np.ndarray, " s"]:
+    """The blocks as one array; NaN (a vertex in the camera's plane, which has no projection) becomes infinity."""
     return np.nan_to_num(np.concatenate(blocks), nan=np.inf, posinf=np.inf)
 
 
-def _placed(T: Float[np.ndarray, "s 4 4"], vertices: Vertices) -> Float[np.ndarray, "s v 3"]:
+def _transform_all(T: Float[np.ndarray, "s 4 4"], vertices: Vertices) -> Float[np.ndarray, "s v 3"]:
     return vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
 
 
-def _blocks(symmetries: Float[np.ndarray, "s 4 4"], vertex_count: int) -> list[Float[np.ndarray, "_b 4 4"]]:
+def _split_symmetries(symmetries: Float[np.ndarray, "s 4 4"], vertex_count: int) -> list[Float[np.ndarray, "_b 4 4"]]:
     rows = max(1, _BLOCK_FLOATS // (3 * vertex_count))
     return [symmetries[i : i + rows] for i in range(0, len(symmetries), rows)]

@@ -82,7 +82,7 @@ def test_rotations_rounded_to_three_decimals_are_read(tmp_path: Path):
         ([HEADER, LINE.replace("1.5 -2 700", "1.5 -2")], ["line 2", "field t", "2 numbers", "3 finite numbers"]),
         ([HEADER, LINE.replace("700", "inf")], ["line 2", "field t", "inf"]),
         ([HEADER, LINE.replace("1.5 -2", "1.5 x")], ["line 2", "field t", "x"]),
-        ([HEADER, LINE.replace("1 0 0 0 1 0", "1 0 0 0 1.1 0")], ["line 2", "field R", "off the identity"]),
+        ([HEADER, LINE.replace("1 0 0 0 1 0", "1 0 0 0 1.1 0")], ["line 2", "field R", "differs from the identity"]),
         ([HEADER, LINE.replace("0 0 1,", "0 0 -1,")], ["line 2", "field R", "reflection"]),
         ([HEADER, LINE.replace("1,2,3,", "1,2.0,3,")], ["line 2", "field im_id", "'2.0'"]),
         ([HEADER, LINE.replace("1,2,3,", "-1,2,3,")], ["line 2", "field scene_id", "'-1'"]),

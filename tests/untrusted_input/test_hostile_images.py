@@ -107,7 +107,7 @@ def test_a_program_is_no_image_and_is_not_run(tmp_path: Path, monkeypatch):
     (tmp_path / "gs").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     (tmp_path / "photo.png").write_bytes(BOMBS["program"])
-    assert "no image format known" in outcome(lambda: read_rgb(tmp_path / "photo.png"))
+    assert "unknown image format" in outcome(lambda: read_rgb(tmp_path / "photo.png"))
     assert not (tmp_path / "ran").exists()
 
 
