@@ -1,4 +1,4 @@
-"""seed -> an object to train on: assemblies of turned, extruded, bent, bumpy, box-like parts, mostly of plain colour.
+"""seed -> an object to train on: assemblies of revolve, extruded, bent, bumpy, box-like parts, mostly of plain colour.
 
 Wider than ``synthetic.objects``, whose objects the benchmark uses: symmetric ones, hollow ones and thin ones are among
 these, and so are objects of a single colour.
@@ -13,7 +13,16 @@ from jaxtyping import Float, Int, UInt8
 
 from pipeline.functional.viewpoints import icosphere_mesh
 from pipeline.items.objects import Mesh
-from pipeline.synthetic.parts import Rng, Shape, noise, random_direction, random_rotation, superquadric, tube, turned
+from pipeline.synthetic.parts import (
+    Rng,
+    Shape,
+    random_direction,
+    random_rotation,
+    revolve,
+    smooth_noise,
+    superquadric,
+    tube,
+)
 
 Points = Float[np.ndarray, "v 3"]
 
@@ -46,8 +55,8 @@ def _assembly(rng: Rng) -> list[Shape]:
 def _blob(rng: Rng) -> list[Shape]:
     """A sphere displaced by smooth noise."""
     points, faces = icosphere_mesh(3)
-    radius = 1 + rng.uniform(0.1, 0.4) * noise(points, rng, scale=rng.uniform(0.6, 1.1))
-    radius = radius + rng.uniform(0, 0.12) * noise(points, rng, scale=0.3)
+    radius = 1 + rng.uniform(0.1, 0.4) * smooth_noise(points, rng, scale=rng.uniform(0.6, 1.1))
+    radius = radius + rng.uniform(0, 0.12) * smooth_noise(points, rng, scale=0.3)
     return [(points * np.maximum(radius, 0.3)[:, None] * rng.uniform(0.45, 1.1, 3), faces)]
 
 
@@ -66,7 +75,7 @@ def _figure(rng: Rng) -> list[Shape]:
 
 def _lump(rng: Rng, size: Float[np.ndarray, " 3"]) -> Shape:
     points, faces = superquadric(rng, size, roundness=float(rng.uniform(0.6, 1.1)))
-    bumps = 1 + rng.uniform(0, 0.12) * noise(points / size, rng, scale=0.5)
+    bumps = 1 + rng.uniform(0, 0.12) * smooth_noise(points / size, rng, scale=0.5)
     return points * bumps[:, None], faces
 
 
@@ -75,7 +84,7 @@ def _turning(rng: Rng) -> list[Shape]:
     rows = 60
     height = np.linspace(-1, 1, rows) * rng.uniform(0.4, 1.2)
     along = np.stack([np.linspace(-1, 1, rows), np.zeros(rows), np.zeros(rows)], -1)
-    profile = 0.6 + rng.uniform(0.05, 0.25) * noise(along, rng, scale=rng.uniform(0.3, 0.9))
+    profile = 0.6 + rng.uniform(0.05, 0.25) * smooth_noise(along, rng, scale=rng.uniform(0.3, 0.9))
     if rng.uniform() < 0.4:  # steps, as of cans and bottles
         profile = np.where(np.linspace(0, 1, rows) > rng.uniform(0.5, 0.9), profile * rng.uniform(0.3, 0.8), profile)
     profile = np.maximum(profile, 0.12)
@@ -83,7 +92,7 @@ def _turning(rng: Rng) -> list[Shape]:
         height = np.concatenate([height, height[::-1][:-4]])
         profile = np.concatenate([profile, np.maximum(profile[::-1][:-4] - 0.08, 0.05)])
     segments = int(rng.choice([6, 8, 48, 48]))
-    parts = [turned(profile[:, None] * np.ones(segments), height)]
+    parts = [revolve(profile[:, None] * np.ones(segments), height)]
     for _ in range(int(rng.choice([0, 0, 1, 1, 2]))):
         parts.append(_handle(rng, float(profile[:rows].mean()), float(np.ptp(height))))
     return parts
@@ -109,13 +118,13 @@ def _extrusion(rng: Rng) -> list[Shape]:
         outline = outline / np.cos((angle % (2 * np.pi / corners)) - np.pi / corners)
     height = np.linspace(-1, 1, rows) * rng.uniform(0.1, 0.9)
     taper = np.linspace(1, rng.uniform(0.5, 1.1), rows)
-    points, faces = turned(np.clip(outline, 0.15, 1.4) * taper[:, None], height)
+    points, faces = revolve(np.clip(outline, 0.15, 1.4) * taper[:, None], height)
     turn = rng.choice([0, 0, rng.uniform(-1.5, 1.5)]) * points[:, 2]
     c, s = np.cos(turn), np.sin(turn)
     points = np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]], -1)
     parts = [(points, faces)]
     for _ in range(int(rng.integers(0, 3))):
-        boss, boss_faces = turned(
+        boss, boss_faces = revolve(
             np.full((8, 24), rng.uniform(0.08, 0.35)), np.linspace(0, rng.uniform(0.2, 0.8), 8), lid=3
         )
         parts.append((boss + np.array([*rng.uniform(-0.4, 0.4, 2), height[-1] - 0.05]), boss_faces))
@@ -134,7 +143,7 @@ def _machine(rng: Rng) -> list[Shape]:
             points, faces = superquadric(rng, rng.uniform(0.06, 0.6, 3), roundness=float(rng.uniform(0.1, 0.3)))
         else:
             length = rng.uniform(0.1, 0.8)
-            points, faces = turned(np.full((12, 28), rng.uniform(0.06, 0.4)), np.linspace(-length, length, 12), lid=3)
+            points, faces = revolve(np.full((12, 28), rng.uniform(0.06, 0.4)), np.linspace(-length, length, 12), lid=3)
             points = np.roll(points, int(rng.integers(3)), axis=-1)
         parts.append((points + at, faces))
     return parts
@@ -147,7 +156,7 @@ def _bar(rng: Rng) -> list[Shape]:
     angle = 2 * np.pi * np.arange(segments) / segments
     lobes = 1 + rng.uniform(0, 0.35) * np.cos(int(rng.integers(2, 5)) * angle) + 0.15 * np.cos(angle)
     thick = rng.uniform(0.1, 0.35) + rng.uniform(-0.1, 0.3) * along + 0.08 * np.sin(rng.uniform(2, 9) * along)
-    points, faces = turned(np.maximum(thick, 0.06)[:, None] * lobes, 2 * along - 1)
+    points, faces = revolve(np.maximum(thick, 0.06)[:, None] * lobes, 2 * along - 1)
     turn = rng.uniform(0, 2.5) * points[:, 2]
     x = np.cos(turn) * points[:, 0] - np.sin(turn) * points[:, 1]
     y = np.sin(turn) * points[:, 0] + np.cos(turn) * points[:, 1]
@@ -171,7 +180,7 @@ def _pipes(rng: Rng) -> list[Shape]:
     parts = []
     for _ in range(int(rng.integers(1, 4))):
         t = np.linspace(0, 1, 40)
-        x, z = (np.cumsum(noise(np.stack([t, 0 * t, 0 * t], -1), rng, scale=0.25)) / 20 for _ in range(2))
+        x, z = (np.cumsum(smooth_noise(np.stack([t, 0 * t, 0 * t], -1), rng, scale=0.25)) / 20 for _ in range(2))
         points, faces = tube(np.stack([x, 0 * t, z + 2 * t - 1], -1), rng.uniform(0.06, 0.22))
         parts.append((points @ random_rotation(rng).T * rng.uniform(0.5, 1), faces))
     return parts
@@ -203,10 +212,12 @@ def _colours(points: Points, part: Int[np.ndarray, " v"], rng: Rng) -> UInt8[np.
         seeds = points[rng.integers(len(points), size=int(rng.integers(2, 8)))]
         index = ((points[:, None] - seeds) ** 2).sum(-1).argmin(axis=1) % 4
     elif style == "pattern":
-        index = (noise(points, rng, scale=rng.uniform(0.12, 0.5)) > rng.uniform(-0.5, 0.8)).astype(int)
-        index += 2 * (noise(points, rng, scale=rng.uniform(0.3, 0.8)) > 0.8)
+        index = (smooth_noise(points, rng, scale=rng.uniform(0.12, 0.5)) > rng.uniform(-0.5, 0.8)).astype(int)
+        index += 2 * (smooth_noise(points, rng, scale=rng.uniform(0.3, 0.8)) > 0.8)
     dirt = (
-        1 + rng.uniform(0, 0.15) * noise(points, rng, scale=0.35) + rng.uniform(0, 0.08) * noise(points, rng, scale=0.1)
+        1
+        + rng.uniform(0, 0.15) * smooth_noise(points, rng, scale=0.35)
+        + rng.uniform(0, 0.08) * smooth_noise(points, rng, scale=0.1)
     )
     baked = 1 + rng.choice([0.0, rng.uniform(0, 0.35)]) * points @ random_direction(rng)
     return np.clip(palette[index] * (dirt * baked)[:, None], 0, 255).astype(np.uint8)

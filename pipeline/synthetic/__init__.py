@@ -1,1 +1,1 @@
-"""Procedural objects and scenes in BOP format: demo and tests need no download and have exact ground truth."""
+"""Procedural objects and scenes in BOP format, so that demo and tests have exact ground truth without a download."""

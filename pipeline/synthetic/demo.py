@@ -1,4 +1,4 @@
-"""The demo's dataset: written when it is first asked for, then opened like any other."""
+"""The demo dataset, generated on first use."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pipeline.synthetic.scenes import write_dataset
 class DemoConfig(Spec):
     """Procedural objects in cluttered, partly occluded scenes with exact ground truth.
 
-    ``root`` holds one folder for every choice of the other fields. ``per_image``: objects in one image; ``occluded``:
-    the share of them that a distractor hides in part.
+    ``root`` has one folder for each combination of the other fields. ``per_image``: objects per image. ``occluded``:
+    share of the instances that a distractor hides in part.
     """
 
     kind: ClassVar[str] = "dataset.demo"
@@ -31,7 +31,7 @@ class DemoConfig(Spec):
     seed: NonNegative = 0
 
     def open(self) -> Dataset:
-        """The dataset. Raises BadInput when its folder cannot be written."""
+        """The dataset. Raises BadInput if its folder cannot be written."""
         chosen: dict[str, Any] = {k: v for k, v in asdict(self).items() if k not in ("root", "name")}
         root = Path(self.root).expanduser() / digest(chosen)[:8]
         if not root.exists():
@@ -39,7 +39,7 @@ class DemoConfig(Spec):
             try:
                 write_dataset(root, **chosen)
             except (OSError, BadInput) as error:
-                if not (root / "dataset_info.json").is_file():  # else another process was first, with the same bytes
+                if not (root / "dataset_info.json").is_file():  # otherwise another process wrote the same bytes first
                     why = error.strerror if isinstance(error, OSError) else error
                     raise BadInput("dataset.root", found=f"{root} ({why})", needed="a folder to write to") from None
         return open_dataset(root, name=self.name)

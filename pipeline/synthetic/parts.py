@@ -1,4 +1,4 @@
-"""The parts that procedural objects are made of: superquadrics, turned bodies, tubes, noise in space."""
+"""Building blocks of procedural objects: superquadrics, surfaces of revolution, tubes, smooth noise."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Rng = np.random.Generator
 
 
 def superquadric(rng: Rng, size: Float[np.ndarray, " 3"], roundness: float | None = None, level: int = 3) -> Shape:
-    """|x|^p + |y|^p + |z|^p = 1 with p = 2 / roundness, scaled; 1 is an ellipsoid, 0.2 nearly a box."""
+    """|x|^p + |y|^p + |z|^p = 1 with p = 2 / roundness, scaled: an ellipsoid at roundness 1, nearly a box at 0.2."""
     power = 2 / (rng.uniform(0.3, 1.2) if roundness is None else roundness)
     points, faces = icosphere_mesh(level)
     return points / (np.abs(points) ** power).sum(axis=-1, keepdims=True) ** (1 / power) * size, faces
 
 
-def turned(radius: Float[np.ndarray, "r s"], height: Float[np.ndarray, " r"], *, lid: int = 10) -> Shape:
-    """Rings of ``s`` points about the z axis, one above another, closed at both ends by ``lid`` rings and a point."""
+def revolve(radius: Float[np.ndarray, "r s"], height: Float[np.ndarray, " r"], *, lid: int = 10) -> Shape:
+    """Rings of ``s`` points around the z axis, stacked, closed at both ends by ``lid`` rings and a point."""
     shrink = (np.arange(lid) + 0.5) / lid
     radius = np.concatenate([radius[:1] * shrink[:, None], radius, radius[-1:] * shrink[::-1, None]])
     height = np.concatenate([np.repeat(height[0], lid), height, np.repeat(height[-1], lid)])
@@ -28,7 +28,7 @@ def turned(radius: Float[np.ndarray, "r s"], height: Float[np.ndarray, " r"], *,
     rings = np.stack(
         [radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(height[:, None], radius.shape)], -1
     )
-    return closed_grid(rings)
+    return connect_rings(rings)
 
 
 def tube(path: Float[np.ndarray, "r 3"], radius: float) -> Shape:
@@ -38,11 +38,11 @@ def tube(path: Float[np.ndarray, "r 3"], radius: float) -> Shape:
     side = np.array([0.0, 1.0, 0.0])
     angle = 2 * np.pi * np.arange(16) / 16
     ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(tangent, side)[:, None]
-    return closed_grid(path[:, None] + radius * ring)
+    return connect_rings(path[:, None] + radius * ring)
 
 
-def closed_grid(rings: Float[np.ndarray, "r s 3"]) -> Shape:
-    """Triangles between neighbouring rings, and a point in the middle of the first and the last."""
+def connect_rings(rings: Float[np.ndarray, "r s 3"]) -> Shape:
+    """Triangles between neighbouring rings; the first and the last ring are closed by a point at their centre."""
     r, s, _ = rings.shape
     low = (np.arange(r - 1)[:, None] * s + np.arange(s)).reshape(-1)
     next_low = (np.arange(r - 1)[:, None] * s + (np.arange(s) + 1) % s).reshape(-1)
@@ -58,7 +58,7 @@ def closed_grid(rings: Float[np.ndarray, "r s 3"]) -> Shape:
 
 
 def polygon_radius(corner: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
-    """Distance from the origin, which lies inside, to the outline in each direction."""
+    """Distance from the origin to the polygon's outline in each direction; the origin must be inside."""
     a, edge = corner, np.roll(corner, -1, axis=0) - corner
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
     cross = ray[..., 0] * edge[:, 1] - ray[..., 1] * edge[:, 0]
@@ -69,15 +69,17 @@ def polygon_radius(corner: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " 
     return np.where(meets, distance, np.inf).min(axis=1)
 
 
-def together(parts: list[Shape]) -> Shape:
+def merge(parts: list[Shape]) -> Shape:
     """Several shapes as one."""
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
     faces = [part_faces + offset for (_, part_faces), offset in zip(parts, offsets, strict=True)]
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
-def noise(points: Float[np.ndarray, "n 3"], rng: Rng, *, scale: float, waves: int = 24) -> Float[np.ndarray, " n"]:
-    """A smooth random function of space, of about unit variance, whose bumps are ``scale`` wide."""
+def smooth_noise(
+    points: Float[np.ndarray, "n 3"], rng: Rng, *, scale: float, waves: int = 24
+) -> Float[np.ndarray, " n"]:
+    """A smooth random function of space with about unit variance and bumps about ``scale`` wide."""
     k = rng.normal(size=(waves, 3)) / scale
     return np.sin(points @ k.T + rng.uniform(0, 2 * np.pi, waves)).sum(axis=-1) * (2 / waves) ** 0.5
 

@@ -17,13 +17,14 @@ from tqdm import tqdm
 from pipeline.errors import BadInput
 from pipeline.io.meshes import diameter_mm, write_ply
 from pipeline.items.objects import Mesh
-from pipeline.synthetic.arranging import Camera, Rng, Thing, arrange, nominal_K, random_camera, visible_parts
+from pipeline.synthetic.layout import Camera, PlacedObject, arrange, nominal_K, random_camera, visible_parts
 from pipeline.synthetic.objects import make_object
-from pipeline.synthetic.photographs import Wall, photograph
+from pipeline.synthetic.parts import Rng
+from pipeline.synthetic.photograph import Wall, render_photograph
 
 SCENE_ID = 1
 _DEPTH_SCALE = 0.1  # mm per unit of the depth images
-_DISTRACTORS = 6  # objects that occlude and clutter, and that no model is given of
+_DISTRACTORS = 6  # objects that occlude and clutter; the dataset has no models of them
 
 
 def write_dataset(
@@ -37,13 +38,13 @@ def write_dataset(
     occluded: float = 0.5,
     progress: bool = True,
 ) -> None:
-    """Models and one test scene under ``root``, in the layout that BOP's own datasets have.
+    """Write models and one test scene to ``root`` in BOP's layout; ``dataset_info.json`` holds the arguments.
 
-    Each image holds ``per_image`` of the objects at 500 to 1000 mm, once each, before a textured wall. A share
-    ``occluded`` of them is hidden in part by distractors, to a visible fraction within OCCLUDED; the others are free.
-    ``dataset_info.json`` holds the arguments. Camera, light and noise change from image to image. Depth and masks are
-    exact but for depth's rounding to 0.1 mm; no object leaves the image. The same arguments give the same bytes.
-    Raises BadInput for a ``root`` that is not empty; what is interrupted leaves no ``root``.
+    Each image shows ``per_image`` different objects at 500 to 1000 mm in front of a textured wall. A share ``occluded``
+    of them is partly hidden by distractors, to a visible fraction within OCCLUDED; the others are free. Camera, light
+    and noise vary between images. No object extends beyond the image. Masks are exact, depth is rounded to 0.1 mm.
+    The same arguments give the same bytes. Raises BadInput if ``root`` is not empty; an interrupted call leaves no
+    ``root``.
     """
     _check(root, objects=objects, images=images, per_image=per_image, occluded=occluded, size_hw=size_hw)
     root.parent.mkdir(parents=True, exist_ok=True)
@@ -105,49 +106,54 @@ def _write_scene(
         (scene / name).mkdir(parents=True)
     distractors = [make_object(1_000_000 + 1000 * seed + k) for k in range(_DISTRACTORS)]
     records: dict[str, dict[str, Any]] = {"scene_camera": {}, "scene_gt": {}, "scene_gt_info": {}}
-    targets, meant = [], _shares(images * per_image, occluded, np.random.default_rng([seed, 1]))
+    targets, occluded_mask = [], _choose_occluded(images * per_image, occluded, np.random.default_rng([seed, 1]))
     for im_id in tqdm(range(images), desc="synthetic images", disable=not progress):
         rng = np.random.default_rng([seed, 2, im_id])
         camera = random_camera(size_hw, rng)
         chosen = sorted(int(k) for k in rng.permutation(list(models))[:per_image])
-        hidden = meant[im_id * per_image : (im_id + 1) * per_image]
-        things = arrange([(k, models[k]) for k in chosen], hidden, distractors, camera, rng)
-        _write_image(scene, im_id, things, camera, records, rng)
+        hidden = occluded_mask[im_id * per_image : (im_id + 1) * per_image]
+        placed_objects = arrange([(k, models[k]) for k in chosen], hidden, distractors, camera, rng)
+        _write_image(scene, im_id, placed_objects, camera, records, rng)
         targets += [{"im_id": im_id, "inst_count": 1, "obj_id": k, "scene_id": SCENE_ID} for k in chosen]
     for name, record in records.items():
         _write_json(scene / f"{name}.json", record)
     _write_json(root / "test_targets_bop19.json", targets)
 
 
-def _shares(count: int, share: float, rng: Rng) -> Bool[np.ndarray, " n"]:
-    """Which of ``count`` instances are to be occluded: exactly the share, rounded."""
+def _choose_occluded(count: int, share: float, rng: Rng) -> Bool[np.ndarray, " n"]:
+    """Random mask of the ``count`` instances that are to be occluded: exactly the share, rounded."""
     return rng.permutation(np.arange(count) < round(share * count))
 
 
 def _write_image(
-    scene: Path, im_id: int, things: Sequence[Thing], camera: Camera, records: dict[str, dict[str, Any]], rng: Rng
+    scene: Path,
+    im_id: int,
+    placed_objects: Sequence[PlacedObject],
+    camera: Camera,
+    records: dict[str, dict[str, Any]],
+    rng: Rng,
 ) -> None:
     wall = Wall(rng)
-    rgb = photograph(things, wall, camera, rng)
+    rgb = render_photograph(placed_objects, wall, camera, rng)
     depth = wall.depth_mm(camera)
-    for thing, visible in visible_parts(things):
-        depth = np.where(visible, thing.depth_mm, depth)
+    for placed, visible in visible_parts(placed_objects):
+        depth = np.where(visible, placed.depth_mm, depth)
     stored = np.rint(depth / _DEPTH_SCALE).astype(np.uint16)
     _write_png(scene / "rgb" / f"{im_id:06d}.png", rgb)
     _write_png(scene / "depth" / f"{im_id:06d}.png", stored)
     poses: list[dict[str, Any]] = []
     infos: list[dict[str, Any]] = []
-    for thing, visible in visible_parts(things):
-        if not thing.obj_id:
+    for placed, visible in visible_parts(placed_objects):
+        if not placed.obj_id:
             continue
-        silhouette = thing.depth_mm > 0
+        silhouette = placed.depth_mm > 0
         for folder, mask in (("mask", silhouette), ("mask_visib", visible)):
             _write_png(scene / folder / f"{im_id:06d}_{len(poses):06d}.png", mask.astype(np.uint8) * 255)
         poses.append(
             {
-                "cam_R_m2c": thing.T_cam_obj[:3, :3].reshape(-1).tolist(),
-                "cam_t_m2c": thing.T_cam_obj[:3, 3].tolist(),
-                "obj_id": thing.obj_id,
+                "cam_R_m2c": placed.T_cam_obj[:3, :3].reshape(-1).tolist(),
+                "cam_t_m2c": placed.T_cam_obj[:3, 3].tolist(),
+                "obj_id": placed.obj_id,
             }
         )
         infos.append(_gt_info(silhouette, visible, stored > 0))
@@ -159,7 +165,7 @@ def _write_image(
 def _gt_info(
     silhouette: Bool[np.ndarray, "H W"], visible: Bool[np.ndarray, "H W"], measured: Bool[np.ndarray, "H W"]
 ) -> dict[str, Any]:
-    """An instance's entry in scene_gt_info, as bop_toolkit defines it."""
+    """An instance's entry in scene_gt_info.json, as bop_toolkit defines it."""
     count_all, count_visible = int(silhouette.sum()), int(visible.sum())
     return {
         "bbox_obj": _bbox_xywh(silhouette),
@@ -172,7 +178,7 @@ def _gt_info(
 
 
 def _bbox_xywh(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """First column and row, and number of columns and rows; -1 for an empty mask."""
+    """First column and row, number of columns and rows; all -1 for an empty mask."""
     ys, xs = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(ys):
         return [-1, -1, -1, -1]

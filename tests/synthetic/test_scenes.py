@@ -11,8 +11,8 @@ from PIL import Image
 from pipeline.errors import BadInput
 from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.stages.render.raycast import render_depth
-from pipeline.synthetic.arranging import OCCLUDED
 from pipeline.synthetic.demo import DemoConfig
+from pipeline.synthetic.layout import OCCLUDED
 from pipeline.synthetic.scenes import write_dataset
 
 SMALL = {"objects": 3, "images": 4, "seed": 7, "size_hw": (240, 320), "per_image": 3, "progress": False}
