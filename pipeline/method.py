@@ -12,7 +12,7 @@ from pipeline.stages.choose import HypothesisScorer
 from pipeline.stages.cluster import Clusterer
 from pipeline.stages.correspond import Corresponder
 from pipeline.stages.crop import Cropper
-from pipeline.stages.detect import DescribingDetector, Detector
+from pipeline.stages.detect import Detector
 from pipeline.stages.extract import Extractor
 from pipeline.stages.fuse import Fuser
 from pipeline.stages.match import Matcher
@@ -41,7 +41,7 @@ class Stages:
     solve: Solver
     choose: HypothesisScorer
     refine: Refiner
-    detect: Detector | DescribingDetector
+    detect: Detector
     fallback: bool = False
     second_look: int = 0
 

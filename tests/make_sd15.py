@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from pipeline.backbones.stable_diffusion.loading import allocate_model
-from pipeline.stages.extract.random_sd import with_random_weights
+from pipeline.stages.extract.random_sd import randomise_weights
 
 VOCABULARY = 49408
 
@@ -72,7 +72,7 @@ def write_folder(root: Path, *, small: bool = True, version: int = 1, dtype: str
         ("unet", UNet2DConditionModel, unet_config(small=small, version=version)),
         ("vae", AutoencoderKL, vae_config(small=small)),
     ):
-        with_random_weights(allocate_model(cls, config, torch_dtype), seed=seed).save_pretrained(root / part)
+        randomise_weights(allocate_model(cls, config, torch_dtype), seed=seed).save_pretrained(root / part)
     write_text_encoder(root / "text_encoder", text_config(small=small, version=version), seed=seed, dtype=torch_dtype)
     write_tokenizer(root / "tokenizer", padding={1: "<|endoftext|>", 2: "!"}[version])
     DDIMScheduler(beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear").save_pretrained(root / "scheduler")

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from pipeline.stages.extract.random_sd import _gaussian
+from pipeline.stages.extract.random_sd import draw_gaussian
 
 WIDTH, HEADS = 48, 6
 PATCH = {"vit": 8, "dinov2": 14, "dinov2_with_registers": 14}
@@ -79,7 +79,7 @@ def tensor_shapes(model_type: str, *, depth: int, grid: int) -> dict[str, tuple[
 
 
 def _drawn(name: str, shape: tuple[int, ...], seed: int) -> torch.Tensor:
-    drawn = _gaussian(name, shape, seed=seed)
+    drawn = draw_gaussian(name, shape, seed=seed)
     if name.endswith(("lambda1", "norm.weight", "norm1.weight", "norm2.weight", "before.weight", "after.weight")):
         return 1 + 0.1 * drawn
     # matrices keep the size of activations; attention that differs from patch to patch has scores beyond 1

@@ -28,6 +28,7 @@ from pipeline.spec import Runtime, Spec, spec
 from pipeline.stages.detect.cnos import Cnos
 from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.detect.json import Json
+from pipeline.stages.detect.proposals import Proposer
 from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.extract.hog import Hog
 from pipeline.stages.match.cosine import Cosine
@@ -39,7 +40,7 @@ CALLS: list[str] = []
 
 
 @spec
-class TrueMasks(Spec):
+class TrueMasks(Proposer):
     """Ground-truth masks, and squares of whatever lies in the corners; nothing of ``blind`` images."""
 
     kind: ClassVar[str] = "proposals.true_masks"

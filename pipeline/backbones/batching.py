@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import psutil
 import torch
@@ -27,15 +26,6 @@ class Footprint:
     bytes_per_pass: int
     bytes_per_crop: int
     max_batch: int
-
-
-@runtime_checkable
-class Sized(Protocol):
-    """An extractor that can tell what it will take; others are of unknown size and get no budget."""
-
-    def footprint(self, layers: Sequence[int], crop_size: int, device: str) -> Footprint:
-        """Of passes that give ``layers`` of crops of that size on "cpu" or "cuda". Raises BadInput."""
-        ...
 
 
 def maps_bytes(shapes: Sequence[tuple[int, int, int]]) -> int:

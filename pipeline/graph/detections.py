@@ -12,13 +12,13 @@ from pipeline.io.digests import files_digest
 from pipeline.items.records import detection_from_record, detection_to_record
 from pipeline.items.views import Detection
 from pipeline.spec import digest
-from pipeline.stages.detect import DescribingDetector
+from pipeline.stages.detect import Descriptors
 from pipeline.store import Ref, make_ref
 
 
 @dataclass(eq=False)
 class DetectionNodes:
-    """The entry of a run's detections. ``proposals`` is None for detectors that read files."""
+    """The entry of a run's detections. ``proposals`` is None for detectors without a describer, which read files."""
 
     context: Context
     proposals: ProposalNodes | None
@@ -33,13 +33,11 @@ class DetectionNodes:
 
     def _sources(self) -> dict[str, str]:
         """Digests of what the detector reads: files, or features of proposals and templates."""
-        detect, root = self.context.stages.detect, self.context.dataset.root
-        if not isinstance(detect, DescribingDetector):
-            files = detect.sources(self.context.dataset, self.context.targets)
+        proposals, context = self.proposals, self.context
+        if proposals is None:
+            root, files = context.dataset.root, context.stages.detect.sources(context.dataset, context.targets)
             named = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
             return {"sources": files_digest(named)}
-        assert self.proposals is not None
-        proposals, context = self.proposals, self.context
         objects = {f"object {obj_id}": proposals.template_features(obj_id).key for obj_id in context.object_ids}
         images = {f"image {s}/{i}": proposals.features((s, i)).key for s, i in context.image_ids}
         return objects | images
@@ -66,18 +64,15 @@ class DetectionNodes:
         return record | {"time_s": 0.0} if self.proposals else record
 
     def _detect(self) -> list[Detection]:
-        context, detect, proposals = self.context, self.context.stages.detect, self.proposals
-        if not isinstance(detect, DescribingDetector):
-            return detect(context.dataset, context.targets)
-        assert proposals is not None
+        descriptors = None if self.proposals is None else self._describe(self.proposals)
+        return self.context.stages.detect(self.context.dataset, self.context.targets, descriptors)
+
+    def _describe(self, proposals: ProposalNodes) -> Descriptors:
+        """Descriptors of all objects and images, computed where they are missing."""
+        context = self.context
         with context.progress.bar(len(context.object_ids), "descriptions", "object") as advance:
             context.run_task(proposals.describe_task, context.object_ids, advance)
         with context.progress.bar(len(context.image_ids), "proposals", "image") as advance:
             context.run_task(proposals.propose_task, context.image_ids, advance)
         templates = {obj_id: proposals.template_descriptors(obj_id) for obj_id in context.object_ids}
-        detections: list[Detection] = []
-        for image in context.image_ids:
-            targets = [t for t in context.targets if (t.scene_id, t.im_id) == image]
-            described = proposals.read_described(image)
-            detections += detect.by_description(targets, *described, templates, proposals.time_s(image))
-        return detections
+        return Descriptors(templates, proposals.image_descriptors)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
-from pipeline.backbones.batching import Footprint, Sized
+from pipeline.backbones.batching import Footprint
+from pipeline.backbones.extractor import footprint_of
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.templates import CROPS_PER_BATCH, RERENDER_SCALE, VIEWS_PER_BATCH
@@ -106,19 +107,20 @@ def _backbone_needs(context: Context, proposals: ProposalNodes | None) -> tuple[
     """Footprint of the largest pass, bytes of all weights, and the models of unknown size."""
     extractors = [(context, context.stages.layers)]
     if proposals is not None and proposals.context is not context:
-        extractors.append((proposals.context, (proposals.detector.describe_layer,)))
+        extractors.append((proposals.context, (proposals.describer.layer,)))
     device = torch.device(context.device).type
     footprints: list[Footprint] = []
     unknown: list[str] = []
     for owner, layers in extractors:
         extract = owner.stages.extract
-        if isinstance(extract, Sized):
-            footprints.append(extract.footprint(layers, owner.stages.crop.size, device))
-        else:
+        footprint = footprint_of(extract, layers, owner.stages.crop.size, device)
+        if footprint is None:
             unknown.append(extract.kind)
-    weights = sum(footprint.weight_bytes for footprint in footprints)
+        else:
+            footprints.append(footprint)
+    weights = sum(f.weight_bytes for f in footprints)
     if proposals is not None:
-        weights += getattr(proposals.detector.proposals, "weight_bytes", int)()
+        weights += proposals.describer.proposer.weight_bytes()
         unknown.append("passes of the proposer")
     largest = max(footprints, key=lambda f: f.bytes_per_pass + f.bytes_per_crop, default=None)
     return largest, weights, tuple(unknown)

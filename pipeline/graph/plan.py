@@ -106,7 +106,7 @@ class Plan:
         yield self._node("detections", f"{len(self.context.targets)} targets", self.detections.ref, None, cost)
 
     def _described_template_nodes(self, proposals: ProposalNodes, obj_id: int) -> Iterator[Node]:
-        n, layer = self._count_views(obj_id), proposals.detector.describe_layer
+        n, layer = self._count_views(obj_id), proposals.describer.layer
         refs = {layer: proposals.template_features(obj_id)}
         of = f"object {obj_id}, for the detector"
         nodes = self._feature_nodes("template features", of, refs, n, proposals.context)

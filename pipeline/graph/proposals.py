@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -21,37 +20,36 @@ from pipeline.io.digests import file_digest
 from pipeline.items.records import proposal_from_record, proposal_to_record
 from pipeline.items.views import Crops, Proposal
 from pipeline.spec import digest
-from pipeline.stages.detect import DescribingDetector
+from pipeline.stages.detect import Describer, ImageDescriptors
 from pipeline.stages.detect.proposals import LoadedProposer
-from pipeline.stages.extract import Extractor
 from pipeline.store import Ref, make_ref
 
 
 @dataclass(eq=False)
 class ProposalNodes:
-    """Entries that a describing detector reads. Methods without a verb name entries.
+    """Entries of a detector with a describer. Methods without a verb name entries.
 
-    ``context`` has the detector's extractor instead of the route's. Templates and their crops are the same entries as
+    ``context`` has the describer's extractor instead of the route's. Templates and their crops are the same entries as
     the route's, and so are their features if both use the same extractor.
     """
 
     context: Context
-    detector: DescribingDetector
+    describer: Describer
     _proposal_refs: dict[ImageId, Ref] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def templates(self) -> TemplateNodes:
-        """Entries of objects with the detector's extractor."""
+        """Entries of objects with the describer's extractor."""
         return TemplateNodes(self.context)
 
     @cached_property
     def proposer(self) -> LoadedProposer:
         """The proposer with its weights, loaded when the first image lacks proposals."""
-        return self.detector.proposals.load(self.context.runtime)
+        return self.describer.proposer.load(self.context.runtime)
 
     def check(self) -> None:
         """Raise BadInput for missing weights, a missing layer, and an extractor that needs the true pose."""
-        extract, layer = self.context.stages.extract, self.detector.describe_layer
+        extract, layer = self.context.stages.extract, self.describer.layer
         if extract.needs_geometry:
             raise BadInput("detect.describe", found=f"{extract.kind}, an oracle", needed="an extractor of photographs")
         try:
@@ -61,13 +59,13 @@ class ProposalNodes:
                 raise
             needed = f"{error.needed}; or an extractor that has it (extract@detect.describe=NAME)"
             raise BadInput("detect.describe_layer", found=error.found, needed=needed) from None
-        self.detector.proposals.recipe()  # looks for the weights
+        self.describer.proposer.recipe()  # looks for the weights
 
     # --- objects ---------------------------------------------------------------------------------------------------
 
     def template_features(self, obj_id: int) -> Ref:
         """Features of an object's templates from which their descriptors are pooled."""
-        return self.templates.features(obj_id, self.detector.describe_layer)
+        return self.templates.features(obj_id, self.describer.layer)
 
     @cached_property
     def describe_task(self) -> Task[int]:
@@ -80,7 +78,7 @@ class ProposalNodes:
     def _describe(self, obj_id: int, advance: Advance) -> None:
         count = self.templates.make_templates(obj_id)
         self.templates.make_crops(obj_id, count)
-        self.templates.make_features(obj_id, count, [self.detector.describe_layer])
+        self.templates.make_features(obj_id, count, [self.describer.layer])
         advance(1)
 
     def template_descriptors(self, obj_id: int) -> Float[torch.Tensor, "n c"]:
@@ -92,7 +90,7 @@ class ProposalNodes:
     def proposals(self, image: ImageId) -> Ref:
         """Proposals of an image."""
         if image not in self._proposal_refs:
-            recipe = {"kind": "proposals", "proposals": self.detector.proposals.recipe()}
+            recipe = {"kind": "proposals", "proposals": self.describer.proposer.recipe()}
             inputs = {"image": file_digest(self.context.dataset.image_path(*image))}
             self._proposal_refs[image] = make_ref("proposals", recipe, inputs)
         return self._proposal_refs[image]
@@ -107,7 +105,7 @@ class ProposalNodes:
 
     def features(self, image: ImageId) -> Ref:
         """Features of these crops; an image without crops has no such entry."""
-        return self.context.features(self.detector.describe_layer, {"crops": self.crops(image).key})
+        return self.context.features(self.describer.layer, {"crops": self.crops(image).key})
 
     @cached_property
     def propose_task(self) -> Task[ImageId]:
@@ -122,21 +120,22 @@ class ProposalNodes:
     def _make(self, image: ImageId, advance: Advance) -> None:
         rows = self._make_crops(image, self._make_proposals(image))
         if rows:
-            refs = {self.detector.describe_layer: self.features(image)}
+            refs = {self.describer.layer: self.features(image)}
             self.context.extract("proposal features", "", refs, rows, lambda batch: self._read_crops(image, batch))
         advance(1)
 
-    def read_described(self, image: ImageId) -> tuple[list[Proposal], Float[torch.Tensor, "p c"]]:
-        """The p proposals of an image that have a crop, and their descriptors."""
+    def image_descriptors(self, image: ImageId) -> ImageDescriptors:
+        """The proposals of an image that have a crop, with their descriptors."""
         kept = self.context.store.read(self.crops(image)).document["kept"]
         records = self.context.store.read(self.proposals(image)).document
         if not kept:
-            channels = self.context.stages.extract.feature_shape(self.detector.describe_layer)[0]
-            return [], torch.zeros((0, channels), device=self.context.device)
+            channels = self.context.stages.extract.feature_shape(self.describer.layer)[0]
+            return ImageDescriptors([], torch.zeros((0, channels), device=self.context.device), self._time_s(image))
         proposals = [proposal_from_record(records[position]) for position in kept]
-        return proposals, self._read_descriptors(self.crops(image), self.features(image))
+        descriptors = self._read_descriptors(self.crops(image), self.features(image))
+        return ImageDescriptors(proposals, descriptors, self._time_s(image))
 
-    def time_s(self, image: ImageId) -> float:
+    def _time_s(self, image: ImageId) -> float:
         """Seconds that an image's proposals, crops and features took."""
         read = self.context.store.read
         crops = read(self.crops(image))
@@ -195,13 +194,12 @@ class ProposalNodes:
 
 
 def proposal_nodes(context: Context) -> ProposalNodes | None:
-    """Nodes of the run's detector; None for a detector that does not describe proposals."""
-    detector = context.stages.detect
-    if not isinstance(detector, DescribingDetector):
+    """Nodes of the detector's describer; None for a detector without one."""
+    describer = context.stages.detect.describer
+    if describer is None:
         return None
-    extract = cast(Extractor, detector.describe)
-    if extract == context.stages.extract:
-        return ProposalNodes(context, detector)  # shares the loaded backbone
-    own_context = replace(context, stages=replace(context.stages, extract=extract))
+    if describer.extractor == context.stages.extract:
+        return ProposalNodes(context, describer)  # shares the loaded backbone
+    own_context = replace(context, stages=replace(context.stages, extract=describer.extractor))
     own_context.models = context.models  # shares the meshes
-    return ProposalNodes(own_context, detector)
+    return ProposalNodes(own_context, describer)

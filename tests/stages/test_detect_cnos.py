@@ -1,23 +1,26 @@
 """What is made of descriptors: assignment, thresholds, suppression, reasons."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from pipeline.bop.dataset import Dataset
 from pipeline.bop.masks import encode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.features import CLASS_TOKEN_LAYER
 from pipeline.items.views import Detection, Proposal, Target
 from pipeline.spec import build
-from pipeline.stages.detect import DescribingDetector
+from pipeline.stages.detect import Descriptors, ImageDescriptors
 from pipeline.stages.detect.cnos import Cnos
 from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.detect.proposals.sam import Sam
 from pipeline.stages.extract.hog import Hog
 
+DATASET = Dataset("toy", Path("unused"), "test", "models", {})  # detections depend on descriptors alone
 TARGETS = [Target(1, 4, 3, 2), Target(1, 4, 5, 1)]
 AXES = torch.eye(4)
 TEMPLATES = {3: AXES[[0] * 6], 5: AXES[[1] * 6], 9: AXES[[2] * 6]}  # each object looks the same in all of its views
@@ -45,7 +48,8 @@ def found(
     parts: list[tuple[Proposal, torch.Tensor]], templates: Mapping[int, torch.Tensor] = TEMPLATES, **fields: object
 ) -> list[Detection]:
     described = torch.stack([d for _, d in parts]) if parts else torch.zeros((0, 4))
-    return cnos(**fields).by_description(TARGETS, [p for p, _ in parts], described, templates, 1.5)
+    image = ImageDescriptors([p for p, _ in parts], described, 1.5)
+    return cnos(**fields)(DATASET, TARGETS, Descriptors(templates, lambda image_id: image))
 
 
 def test_each_proposal_goes_to_the_object_it_looks_most_like():
@@ -106,9 +110,10 @@ def test_a_target_that_is_not_found_says_why(parts: list, reason: str):
     assert (five.rle, five.score, five.bbox_xyxy) == (None, 0.0, (0.0, 0.0, 0.0, 0.0))
 
 
-def test_only_what_describes_is_a_describing_detector():
-    assert isinstance(cnos(), DescribingDetector)
-    assert not isinstance(GtMask(), DescribingDetector)
+def test_a_detector_says_how_proposals_are_described_or_that_none_are():
+    describer = cnos(describe_layer=8).describer
+    assert (describer.proposer, describer.extractor, describer.layer) == (Sam(), Hog(), 8)
+    assert GtMask().describer is None
 
 
 @pytest.mark.parametrize(

@@ -2,53 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.backbones.extractor import Extractor
 from pipeline.bop.dataset import Dataset
 from pipeline.items.views import Detection, Proposal, Target
-from pipeline.spec import Spec, Variant
+from pipeline.spec import Variant
 from pipeline.stages.detect.proposals import Proposer
 
 
+@dataclass(frozen=True)
+class Describer:
+    """How proposals and templates get their descriptors: the extractor's map of ``layer``, averaged over the mask."""
+
+    proposer: Proposer
+    extractor: Extractor
+    layer: int
+
+
+@dataclass(frozen=True, eq=False)
+class ImageDescriptors:
+    """An image's proposals, a descriptor of each, and the seconds that computing them took."""
+
+    proposals: Sequence[Proposal]
+    descriptors: Float[Tensor, "p c"]
+    time_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Descriptors:
+    """Descriptors of the templates of every object of the run, by obj_id, and of any image (scene_id, im_id)."""
+
+    templates: Mapping[int, Float[Tensor, "n c"]]
+    of_image: Callable[[tuple[int, int]], ImageDescriptors]
+
+
 class Detector(Variant, Protocol):
-    """What a detect variant is that reads its detections from files."""
+    """Contract of every detect variant.
 
-    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """The files whose bytes decide the answer (they enter the key)."""
-        ...
-
-    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
-        """Detections of the targets' objects in the targets' images, best score first within image and object."""
-        ...
-
-
-@runtime_checkable
-class DescribingDetector(Variant, Protocol):
-    """A detect variant that compares proposals with templates by features; the graph provides both and keeps them.
-
-    ``describe``: an extract variant; one vector of a crop is its map of ``describe_layer``, averaged over the mask.
+    ``describer``: None for a variant that reads its detections from files. Otherwise the graph computes and caches the
+    descriptors it defines, and passes them to the call.
     """
 
-    proposals: Proposer
-    describe: Spec
-    describe_layer: int
+    @property
+    def describer(self) -> Describer | None:
+        """See the class."""
+        ...
 
-    def by_description(
-        self,
-        targets: Sequence[Target],
-        proposals: Sequence[Proposal],
-        described: Float[Tensor, "p c"],
-        templates: Mapping[int, Float[Tensor, "n c"]],
-        time_s: float,
+    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+        """Files whose bytes determine the detections (they enter the key); not asked of a variant with a describer."""
+        ...
+
+    def __call__(
+        self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
-        """Detections of one image's targets, best score first within an object.
-
-        ``described``: descriptors of the proposals; ``templates``: those of every object of the run, by obj_id;
-        ``time_s``: seconds that the image has taken so far. A target without a detection gets one with a defect.
-        """
+        """Detections of the targets' objects in the targets' images, best score first within image and object."""
         ...

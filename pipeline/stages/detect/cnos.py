@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.backbones.extractor import Extractor
+from pipeline.bop.dataset import Dataset
 from pipeline.functional.boxes import non_maximum_suppression
 from pipeline.functional.descriptors import mean_top_cosine
 from pipeline.items.features import CLASS_TOKEN_LAYER
 from pipeline.items.views import Detection, Proposal, Target
 from pipeline.spec import Fraction, Positive, Spec, spec
+from pipeline.stages.detect import Describer, Descriptors, ImageDescriptors
 from pipeline.stages.detect.proposals import Proposer
 from pipeline.stages.detect.proposals.sam import Sam
 
@@ -45,46 +49,62 @@ class Cnos(Spec):
     max_per_image: Positive = 100
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
 
-    def by_description(
-        self,
-        targets: Sequence[Target],
-        proposals: Sequence[Proposal],
-        described: Float[Tensor, "p c"],
-        templates: Mapping[int, Float[Tensor, "n c"]],
-        time_s: float,
+    @property
+    def describer(self) -> Describer:
+        """``describe``, ``describe_layer`` and ``proposals``."""
+        return Describer(self.proposals, cast(Extractor, self.describe), self.describe_layer)
+
+    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
+        """None: detections depend on the descriptors, whose keys the graph knows."""
+        return []
+
+    def __call__(
+        self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
-        """See DescribingDetector."""
-        assigned = _assigned(described, templates, best=self.best)
-        ranked = self._ranked(targets, proposals, assigned)
+        """At least one detection of each target; where nothing was found it has a defect that says why."""
+        assert descriptors is not None, "the graph computes descriptors for a detector with a describer"
+        found: list[Detection] = []
+        for image in sorted({(target.scene_id, target.im_id) for target in targets}):
+            in_image = [target for target in targets if (target.scene_id, target.im_id) == image]
+            found += self._detect(in_image, descriptors.of_image(image), descriptors.templates)
+        return found
+
+    def _detect(
+        self, targets: Sequence[Target], image: ImageDescriptors, templates: Mapping[int, Float[Tensor, "n c"]]
+    ) -> list[Detection]:
+        """Detections of one image's targets."""
+        proposals, time_s = image.proposals, image.time_s
+        assigned = _assign(image.descriptors, templates, best=self.best)
+        ranked = self._rank(targets, proposals, assigned)
         found: list[Detection] = []
         for target in targets:
             ids = target.scene_id, target.im_id, target.obj_id
-            mine = [i for i in ranked if assigned.obj_id[i] == target.obj_id][: self._count(target)]
+            chosen = [i for i in ranked if assigned.obj_id[i] == target.obj_id][: self._count(target)]
             found += [
                 Detection(*ids, float(assigned.score[i]), time_s, proposals[i].bbox_xyxy, proposals[i].rle)
-                for i in mine
+                for i in chosen
             ]
-            if not mine:
-                reason = self._reason(target, assigned)
+            if not chosen:
+                reason = self._explain(target, assigned)
                 found.append(Detection(*ids, 0.0, time_s, (0.0, 0.0, 0.0, 0.0), defect=reason))
         return found
 
-    def _ranked(self, targets: Sequence[Target], proposals: Sequence[Proposal], assigned: _Assigned) -> list[int]:
+    def _rank(self, targets: Sequence[Target], proposals: Sequence[Proposal], assigned: _Assignment) -> list[int]:
         """Proposals that are detections of the targets' objects, best score first."""
         boxes = np.array([p.bbox_xyxy for p in proposals]).reshape(-1, 4)
-        left = np.zeros(len(proposals), bool)
+        kept = np.zeros(len(proposals), bool)
         for obj_id in {target.obj_id for target in targets}:
-            mine = np.flatnonzero((assigned.obj_id == obj_id) & (assigned.score > self.min_score))
-            left[mine] = non_maximum_suppression(boxes[mine], assigned.score[mine], max_iou=self.nms_iou)
+            of_object = np.flatnonzero((assigned.obj_id == obj_id) & (assigned.score > self.min_score))
+            kept[of_object] = non_maximum_suppression(boxes[of_object], assigned.score[of_object], max_iou=self.nms_iou)
         best_first = np.argsort(-assigned.score, kind="stable").tolist()
-        return [i for i in best_first if left[i]][: self.max_per_image]
+        return [i for i in best_first if kept[i]][: self.max_per_image]
 
     def _count(self, target: Target) -> int | None:
         if self.keep == "all":
             return None
         return target.inst_count if self.keep == "inst_count" else self.keep
 
-    def _reason(self, target: Target, assigned: _Assigned) -> str:
+    def _explain(self, target: Target, assigned: _Assignment) -> str:
         """Why a target has no detection."""
         proposals, scores = len(assigned.score), assigned.score[assigned.obj_id == target.obj_id]
         if not proposals:
@@ -97,17 +117,17 @@ class Cnos(Spec):
 
 
 @dataclass(frozen=True, eq=False)
-class _Assigned:
+class _Assignment:
     """Each proposal's best object and its score for it."""
 
     obj_id: Int[np.ndarray, " p"]
     score: Float[np.ndarray, " p"]
 
 
-def _assigned(
-    described: Float[Tensor, "p c"], templates: Mapping[int, Float[Tensor, "n c"]], *, best: int
-) -> _Assigned:
+def _assign(
+    descriptors: Float[Tensor, "p c"], templates: Mapping[int, Float[Tensor, "n c"]], *, best: int
+) -> _Assignment:
     objects = sorted(templates)
-    scores = torch.stack([mean_top_cosine(described, templates[obj_id], best=best) for obj_id in objects], dim=1)
+    scores = torch.stack([mean_top_cosine(descriptors, templates[obj_id], best=best) for obj_id in objects], dim=1)
     found = scores.max(dim=1)
-    return _Assigned(np.array(objects)[found.indices.cpu().numpy()], found.values.double().cpu().numpy())
+    return _Assignment(np.array(objects)[found.indices.cpu().numpy()], found.values.double().cpu().numpy())

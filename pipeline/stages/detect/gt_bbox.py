@@ -12,6 +12,7 @@ from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Spec, spec
+from pipeline.stages.detect import Descriptors
 from pipeline.stages.detect.annotated import annotation_paths, select_instances
 
 
@@ -25,6 +26,7 @@ class GtBbox(Spec):
 
     kind: ClassVar[str] = "detect.gt_bbox"
     version: ClassVar[int] = 1
+    describer: ClassVar[None] = None
 
     bbox: Literal["visib", "obj"] = "visib"
 
@@ -32,7 +34,9 @@ class GtBbox(Spec):
         """Annotations of the scenes."""
         return annotation_paths(dataset, targets)
 
-    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+    def __call__(
+        self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
+    ) -> list[Detection]:
         """One detection per annotated instance. Raises BadInput for a scene without scene_gt_info.json."""
         for scene_id in sorted({target.scene_id for target in targets}):
             path = dataset.scene(scene_id).folder / "scene_gt_info.json"

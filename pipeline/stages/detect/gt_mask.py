@@ -13,6 +13,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Spec, spec
+from pipeline.stages.detect import Descriptors
 from pipeline.stages.detect.annotated import annotation_paths, image_paths, select_instances
 
 
@@ -26,6 +27,7 @@ class GtMask(Spec):
 
     kind: ClassVar[str] = "detect.gt_mask"
     version: ClassVar[int] = 1
+    describer: ClassVar[None] = None
 
     visible: bool = True
 
@@ -39,7 +41,9 @@ class GtMask(Spec):
         files = annotation_paths(dataset, targets) + image_paths(dataset, targets)
         return files + [path for path in masks if path.exists()]
 
-    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+    def __call__(
+        self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
+    ) -> list[Detection]:
         """One detection per annotated instance of the targets."""
         return [self._detection(dataset, target, gt) for target in targets for gt in select_instances(dataset, target)]
 

@@ -17,6 +17,7 @@ from pipeline.functional.camera import mask_bbox
 from pipeline.io.digests import file_digest
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Positive, Spec, spec
+from pipeline.stages.detect import Descriptors
 from pipeline.stages.detect.annotated import image_paths
 
 
@@ -33,6 +34,7 @@ class Json(Spec):
 
     kind: ClassVar[str] = "detect.json"
     version: ClassVar[int] = 1
+    describer: ClassVar[None] = None
 
     path: str = ""
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
@@ -45,7 +47,9 @@ class Json(Spec):
         """The file, and the photographs for their size."""
         return [self._file(), *image_paths(dataset, targets)]
 
-    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+    def __call__(
+        self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
+    ) -> list[Detection]:
         """The kept detections of each target, best score first. Raises BadInput for a file of another kind."""
         entries = _by_target(self._file())
         return [

@@ -14,6 +14,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Spec, spec
+from pipeline.stages.detect import Descriptors
 
 
 @spec
@@ -22,13 +23,16 @@ class PhotoMask(Spec):
 
     kind: ClassVar[str] = "detect.photo"
     version: ClassVar[int] = 1
+    describer: ClassVar[None] = None
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """The photograph, and the mask if there is one."""
         photo = _photo(dataset)
         return [photo.photo_path] + ([] if photo.mask_file is None else [photo.mask_file])
 
-    def __call__(self, dataset: Dataset, targets: Sequence[Target]) -> list[Detection]:
+    def __call__(
+        self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
+    ) -> list[Detection]:
         """One detection. Raises BadInput for a mask of another size than the photograph, or an empty one."""
         photo = _photo(dataset)
         return [_detection(photo, target) for target in targets]

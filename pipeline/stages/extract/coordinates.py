@@ -1,4 +1,4 @@
-"""crops, geometry -> object coordinates as features: an oracle, under which every pose error is a geometry error."""
+"""crops, geometry -> object coordinates as features: an oracle that leaves only the errors of the geometry stages."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ FINEST = max(CELLS.values())
 
 @spec
 class Coordinates(Spec):
-    """Random Fourier features of the object point that each cell's centre sees; background cells are zero.
+    """Random Fourier features of the object point at each cell's centre; background cells are zero.
 
     The cosine of two cells d mm apart on the object is exp(-d^2 / (2 bandwidth_mm^2)) in expectation over the
     frequencies (Rahimi and Recht, NeurIPS 2007), with a standard error of at most channels^(-1/2).
-    All layers have the finest layer's cells, since interpolating coarse maps would add errors that are not geometry's;
-    each has frequencies of its own.
+    All layers have the finest layer's cells, because interpolating coarse maps would add errors of their own. Each
+    layer draws its own frequencies.
     """
 
     kind: ClassVar[str] = "extract.coordinates"
@@ -48,17 +48,17 @@ class Coordinates(Spec):
         return self.channels, FINEST, FINEST
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As fitting.Sized: the points of a map's cells, float64, and the maps."""
+        """As Extractor.footprint: the float64 points of a map's cells, and the maps."""
         maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
         return Footprint(0, 0, 8 * FINEST**2 * (12 + 2 * self.channels) + maps, max_batch=64)
 
     def load(self, runtime: Runtime) -> CoordinatesBackbone:
-        """Nothing to load."""
+        """The spec on the runtime's device; there are no weights."""
         return CoordinatesBackbone(self, runtime)
 
 
 class CoordinatesBackbone:
-    """A Coordinates spec with its frequencies drawn."""
+    """A Coordinates spec on a device."""
 
     def __init__(self, spec: Coordinates, runtime: Runtime) -> None:
         self.device = torch.device(runtime.torch_device())
@@ -81,9 +81,9 @@ class CoordinatesBackbone:
 
 
 def cell_points(crops: Crops, i: int, *, cells: int) -> tuple[Float[np.ndarray, "hw 3"], Bool[np.ndarray, " hw"]]:
-    """Object points (mm) at the cell centres of crop i, rows first, and which cells see the object.
+    """Object points (mm) at the cell centres of crop i, in row-major order, and which cells lie on the object.
 
-    The ray is that of the exact centre, its depth the nearest pixel's, as in ``lift``.
+    Each point lies on the ray through the exact centre, at the depth of the nearest pixel, as in ``lift``.
     """
     if crops.geometry is None:
         needed = "depth, camera and pose of every view, which templates and ground truth have"
@@ -92,16 +92,16 @@ def cell_points(crops: Crops, i: int, *, cells: int) -> tuple[Float[np.ndarray, 
     grid = np.stack(np.meshgrid(np.arange(cells), np.arange(cells)), axis=-1).reshape(-1, 2)
     px_crop = camera.cell_to_px(torch.from_numpy(grid).double(), size=size, cells=cells).numpy()
     px_img = camera.apply_homography(np.linalg.inv(crops.A_crop_img[i]), px_crop)
-    depth = nearest(depth_mm, px_img, outside=0.0)
-    seen = nearest(crops.mask[i], px_crop, outside=False) & (depth > 0)
+    depth = sample_nearest(depth_mm, px_img, outside=0.0)
+    seen = sample_nearest(crops.mask[i], px_crop, outside=False) & (depth > 0)
     points_cam = camera.unproject(crops.geometry.K[i], px_img, depth)
     return rigid.transform(rigid.inverse(crops.geometry.T_cam_obj[i]), points_cam), seen
 
 
-def nearest(
+def sample_nearest(
     values: Float32[np.ndarray, "H W"] | Bool[np.ndarray, "H W"], px: Float[np.ndarray, "m 2"], *, outside: float | bool
 ) -> np.ndarray:
-    """Values at the pixels that contain the points; ``outside`` where there is none."""
+    """Values at the pixels that contain the points; ``outside`` for points outside the image."""
     column, row = np.floor(px + 0.5).astype(int).T
     height, width = values.shape
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

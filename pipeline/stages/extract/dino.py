@@ -10,7 +10,7 @@ from pipeline.spec import NonNegative, spec
 
 @spec
 class Dino(VitFeatures):
-    """DINO ViT-S/8 or ViT-B/8 (12 blocks; S/16 and B/16 as well); keys, as Amir et al., ECCVW 2022 found best.
+    """DINO ViT-S/8 or ViT-B/8 (12 blocks; S/16 and B/16 as well); keys, which Amir et al., ECCVW 2022 found best.
 
     ZS6D (Ausserlechner et al., ICRA 2024) reads keys at stride 4, layer 11 for templates, layer 9 in bins for
     correspondences, and the saliency of Amir et al.'s four heads.

@@ -14,9 +14,9 @@ from pipeline.spec import Positive, spec
 
 @spec
 class DinoV2(VitFeatures):
-    """DINOv2 ViT-S, B, L or g of patch 14 (12, 12, 24 or 40 blocks); registers never enter a map.
+    """DINOv2 ViT-S, B, L or g of patch 14 (12, 12, 24 or 40 blocks); register tokens are dropped from the maps.
 
-    FoundPose (Ornek et al., ECCV 2024) reads the tokens of layer 18 of ViT-L with registers at 420 px, behind the last
+    FoundPose (Ornek et al., ECCV 2024) reads the tokens of layer 18 of ViT-L with registers at 420 px, after the last
     norm.
     """
 

@@ -1,6 +1,7 @@
-"""crops -> feature maps of the small latent diffusion model that ships with the package. No download, no network.
+"""crops -> feature maps of the small latent diffusion model that ships with the package; nothing is downloaded.
 
-Past the decoder's layers 0 to 11 there is one more, 12: the crop's own gradient histograms, for what 4 px a cell lose.
+Layers 0 to 11 are the decoder's blocks. Layer 12 holds gradient histograms of the crop, which restore detail that the
+decoder's cells of 4 px lose.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, digest, spec
 
 FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
-PROMPT = (1, 1, 32)  # of zeros: the model knows no text
+PROMPT = (1, 1, 32)  # the model was trained without text: its prompt is zeros
 
 WeightSet = Literal["learned", "pure"]
 
@@ -44,7 +45,7 @@ WeightSet = Literal["learned", "pure"]
 class Embedded(DiffusionFeatures):
     """A latent diffusion model of Stable Diffusion's architecture and 1/200 of its size, trained on procedural objects.
 
-    ``weights``: ``pure`` has learned to remove noise and nothing else; ``learned`` went on from there, on exact
+    ``weights``: ``pure`` was trained to remove noise only; ``learned`` was then trained further on exact
     correspondences of rendered pairs, together with the head of ``fuse=learned``. See pipeline/embedded/README.md.
     """
 
@@ -65,17 +66,17 @@ class Embedded(DiffusionFeatures):
         return f"embedded-{self.weights}-{self.weights_digest[:8]}"
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
-        """As DiffusionFeatures.feature_shape; layer 12 has two cells a side for each of the latent's."""
+        """As DiffusionFeatures.feature_shape; layer 12 has 2 x 2 cells for each cell of the latent."""
         if layer != EDGES:
             return super().feature_shape(layer)
         cells = 2 * self.input_size // self.configs.vae_factor
         return ORIENTATIONS, cells, cells
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As DiffusionFeatures.footprint; edges are made after the passes, in less than these take."""
-        most = super().footprint(_decoder(layers), crop_size, device)
+        """As DiffusionFeatures.footprint; histograms are computed after the passes, in less memory than a pass."""
+        decoder = super().footprint(_decoder_layers(layers), crop_size, device)
         edges = [self.feature_shape(layer) for layer in layers if layer == EDGES]
-        return replace(most, bytes_per_crop=most.bytes_per_crop + maps_bytes(edges))
+        return replace(decoder, bytes_per_crop=decoder.bytes_per_crop + maps_bytes(edges))
 
     def load(self, runtime: Runtime) -> EmbeddedBackbone:
         """As DiffusionFeatures.load."""
@@ -83,7 +84,7 @@ class Embedded(DiffusionFeatures):
         return EmbeddedBackbone(self, decoder.configs, decoder.model, decoder.batch)
 
     def recipe(self) -> dict[str, Any]:
-        """As DiffusionFeatures.recipe, with the digest of the weights behind the name of the set."""
+        """As DiffusionFeatures.recipe, with the weights' digest after the name of the set."""
         return super().recipe() | {"weights": f"{self.weights} {self.weights_digest}"}
 
     @cached_property
@@ -113,11 +114,12 @@ class Embedded(DiffusionFeatures):
 
 
 class EmbeddedBackbone(DiffusionBackbone):
-    """The model in memory, and edges."""
+    """The model in memory, with gradient histograms as an additional layer."""
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, in the spec's dtype, on the model's device."""
-        maps = super().__call__(crops, _decoder(layers)) if _decoder(layers) else {}
+        decoder_layers = _decoder_layers(layers)
+        maps = super().__call__(crops, decoder_layers) if decoder_layers else {}
         if EDGES in layers:
             chunks = [self._edges(crops[i : i + self.batch]) for i in range(0, len(crops), self.batch)]
             maps = {**maps, EDGES: torch.cat(chunks)}
@@ -130,7 +132,7 @@ class EmbeddedBackbone(DiffusionBackbone):
         return edges.to(getattr(torch, self.spec.dtype))
 
 
-def _decoder(layers: Sequence[int]) -> list[int]:
+def _decoder_layers(layers: Sequence[int]) -> list[int]:
     return [layer for layer in layers if layer != EDGES]
 
 

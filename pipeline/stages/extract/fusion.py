@@ -1,4 +1,4 @@
-"""crops -> feature maps of two extractors side by side (Zhang et al., NeurIPS 2023: A Tale of Two Features)."""
+"""crops -> feature maps of two extractors, concatenated (Zhang et al., NeurIPS 2023: A Tale of Two Features)."""
 
 from __future__ import annotations
 
@@ -9,39 +9,40 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, PlainValidator
 
-from pipeline.backbones.batching import Footprint, Sized, maps_bytes
+from pipeline.backbones.batching import Footprint, maps_bytes
+from pipeline.backbones.extractor import Backbone, Extractor, footprint_of
 from pipeline.errors import BadInput
 from pipeline.functional.maps import concatenate_normalized
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Fraction, Runtime, Spec, spec
-from pipeline.stages.extract import Backbone, Extractor
 from pipeline.stages.extract.dinov2 import DinoV2
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
 
-def _extractor(value: Any) -> Any:
+def _check_extractor(value: Any) -> Any:
     if not all(hasattr(type(value), name) for name in ("feature_shape", "load", "recipe")):
         raise ValueError("an extract variant, chosen as extract@extract.first=hog")
     return value
 
 
-def _one_of_each(pairs: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+def _check_unique(pairs: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
     if len(dict(pairs)) < len(pairs):
         raise ValueError("each layer of the first extractor once")
     return pairs
 
 
-Member = Annotated[Extractor, PlainValidator(_extractor)]
-LayerPairs = Annotated[tuple[tuple[int, int], ...], Field(min_length=1), AfterValidator(_one_of_each)]
+Member = Annotated[Extractor, PlainValidator(_check_extractor)]
+LayerPairs = Annotated[tuple[tuple[int, int], ...], Field(min_length=1), AfterValidator(_check_unique)]
 
 
 @spec
 class Fusion(Spec):
-    """Two extractors, whatever they are; layer l joins layer l of the first with one of the second.
+    """Any two extractors; layer l concatenates layer l of the first with its partner layer of the second.
 
-    ``layers``: the pairs. A cell has both descriptors at length 1, times ``alpha`` and 1 - ``alpha``, on the cells of
-    the first, so that cosines of the whole are means of both cosines, weighted by the squares of the two.
+    ``layers``: the pairs of layers. The second's map is resampled to the cells of the first; both descriptors of a cell
+    are scaled to unit length and multiplied by ``alpha`` and 1 - ``alpha``. The cosine of two fused cells is then the
+    mean of both cosines, weighted by the squares of these factors.
     """
 
     kind: ClassVar[str] = "extract.fusion"
@@ -59,27 +60,27 @@ class Fusion(Spec):
 
     @property
     def notice(self) -> str:
-        """What there is to know of either."""
+        """The notices of both, each once."""
         return "\n".join(dict.fromkeys(filter(None, [self.first.notice, self.second.notice])))
 
     @property
     def model(self) -> str:
         """Names of both models."""
-        with _told_of("first"):
+        with _name_member("first"):
             first = self.first.model
-        with _told_of("second"):
+        with _name_member("second"):
             return f"fusion-{first}-{self.second.model}"
 
     @property
     def timestep(self) -> int:
-        """The first's, or the second's where the first has none."""
+        """Timestep of the first, or of the second where the first has none."""
         return self.first.timestep or self.second.timestep
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe, with the whole recipes of both."""
-        with _told_of("first"):
+        """As Spec.recipe, with the recipes of both extractors."""
+        with _name_member("first"):
             first = self.first.recipe()
-        with _told_of("second"):
+        with _name_member("second"):
             second = self.second.recipe()
         layers = sorted(list(pair) for pair in self.layers)
         return {
@@ -92,12 +93,12 @@ class Fusion(Spec):
         }
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
-        """(c, h, w). Raises BadInput for a layer that has no pair, or that either extractor does not have."""
+        """(c, h, w). Raises BadInput for a layer without a pair, or that an extractor does not have."""
         other = self.partner(layer)
-        with _told_of("first"):
+        with _name_member("first"):
             channels, h, w = self.first.feature_shape(layer)
         try:
-            with _told_of("second"):
+            with _name_member("second"):
                 return channels + self.second.feature_shape(other)[0], h, w
         except BadInput as fault:
             if not fault.where.endswith(" layer"):
@@ -106,34 +107,35 @@ class Fusion(Spec):
             raise BadInput("extract.layers", found=found, needed=fault.needed) from None
 
     def partner(self, layer: int) -> int:
-        """The second extractor's layer beside ``layer``. Raises BadInput where there is none."""
+        """The second extractor's layer that is paired with ``layer``. Raises BadInput where there is none."""
         pairs = dict(self.layers)
         if layer not in pairs:
             needed = f"one of {', '.join(map(str, sorted(pairs)))}, as extract.layers pairs them"
             raise BadInput("extract layer", found=layer, needed=needed)
         return pairs[layer]
 
-    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As fitting.Sized: both models, and the larger pass of the two with the maps of both. Unknown parts raise."""
-        first = _sized(self.first, "first").footprint(layers, crop_size, device)
-        second = _sized(self.second, "second").footprint([self.partner(k) for k in layers], crop_size, device)
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint | None:
+        """As Extractor.footprint: both models in memory, the larger pass of the two, and the maps of both.
+
+        None where either is unknown.
+        """
+        first = footprint_of(self.first, layers, crop_size, device)
+        second = footprint_of(self.second, [self.partner(k) for k in layers], crop_size, device)
+        if first is None or second is None:
+            return None
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        bytes_per_pass, bytes_per_crop = (
-            max(first.bytes_per_pass, second.bytes_per_pass),
-            max(first.bytes_per_crop, second.bytes_per_crop) + maps,
-        )
         return Footprint(
-            first.weight_bytes + second.weight_bytes,
-            bytes_per_pass,
-            bytes_per_crop,
-            min(first.max_batch, second.max_batch),
+            weight_bytes=first.weight_bytes + second.weight_bytes,
+            bytes_per_pass=max(first.bytes_per_pass, second.bytes_per_pass),
+            bytes_per_crop=max(first.bytes_per_crop, second.bytes_per_crop) + maps,
+            max_batch=min(first.max_batch, second.max_batch),
         )
 
     def load(self, runtime: Runtime) -> FusionBackbone:
         """Weights of both into memory. Raises BadInput for weights that are missing or of another class."""
-        with _told_of("first"):
+        with _name_member("first"):
             first = self.first.load(runtime)
-        with _told_of("second"):
+        with _name_member("second"):
             second = self.second.load(runtime)
         return FusionBackbone(self, first, second)
 
@@ -157,17 +159,9 @@ class FusionBackbone:
         }
 
 
-def _sized(member: Extractor, name: str) -> Sized:
-    if not isinstance(member, Sized):
-        raise BadInput(
-            f"extract.{name}", found=f"{member.kind}, of unknown size", needed="an extractor with a footprint"
-        )
-    return member
-
-
 @contextmanager
-def _told_of(member: str) -> Iterator[None]:
-    """A fault in a field of one of the two names which: extract.weights becomes extract.first.weights."""
+def _name_member(member: str) -> Iterator[None]:
+    """Name the member in errors about its fields: extract.weights becomes extract.first.weights."""
     try:
         yield
     except BadInput as fault:

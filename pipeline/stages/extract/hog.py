@@ -22,11 +22,11 @@ _CROP_PX = 256  # a batch is sized for crops of this side
 
 @spec
 class Hog(Spec):
-    """Gradient histograms per cell with those of its 8 neighbours as context, normalised by local energy.
+    """Gradient histograms of each cell and its 8 neighbours, normalised by local energy.
 
-    ``signed``: an edge from dark to bright differs from its opposite. ``context_cells``: distance of the neighbours.
-    ``silhouette``: weight of gradients at the mask's border, which compare object and black, not object and scene.
-    ``contrast``: grey levels (0..1) per pixel below which a gradient counts as noise.
+    ``signed``: edges from dark to bright and from bright to dark fall into different bins. ``context_cells``: distance
+    of the neighbours. ``silhouette``: weight of gradients at the mask's border, where the background was blackened.
+    ``contrast``: gradients below this many grey levels (0..1) per pixel count as noise.
     """
 
     kind: ClassVar[str] = "extract.hog"
@@ -52,12 +52,12 @@ class Hog(Spec):
         return self.channels, cells_of(layer), cells_of(layer)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As fitting.Sized: gradients of three channels, energies by orientation, and the maps with their context."""
+        """As Extractor.footprint: gradients of three channels, energies by orientation, and maps with their context."""
         maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
         return Footprint(0, 0, 4 * (28 + 3 * self.orientations) * crop_size**2 + maps, max_batch=32)
 
     def load(self, runtime: Runtime) -> HogBackbone:
-        """Nothing to load."""
+        """The spec on the runtime's device; there are no weights."""
         return HogBackbone(self, runtime)
 
 
@@ -76,7 +76,7 @@ class HogBackbone:
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for x in (crops.rgb, crops.mask))
         s = self.spec
         energy = oriented_energy(rgb, mask, orientations=s.orientations, signed=s.signed, silhouette=s.silhouette)
-        # always through the finest cells: a layer has the same bytes whichever others are asked for
+        # always through the finest cells, so that a layer has the same bytes whichever other layers are requested
         finest = cell_means(energy, cells=max(CELLS.values()))
         return {k: self._map(cell_means(finest, cells=n)) for k, n in cells.items()}
 

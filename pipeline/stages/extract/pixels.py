@@ -1,4 +1,4 @@
-"""crops -> their own pixels, shrunk: the control that any features have to beat."""
+"""crops -> their own pixels, downsampled: a baseline that any learned features should beat."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CROP_PX = 256  # a batch is sized for crops of this side
 
 @spec
 class Pixels(Spec):
-    """Each cell's colours, ``side`` x ``side`` of them, in [-1, 1]: no learning, no invariance."""
+    """The ``side`` x ``side`` colours of each cell, in [-1, 1], neither learned nor invariant to anything."""
 
     kind: ClassVar[str] = "extract.pixels"
     version: ClassVar[int] = 1
@@ -36,12 +36,12 @@ class Pixels(Spec):
         return 3 * self.side**2, cells_of(layer), cells_of(layer)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As fitting.Sized."""
+        """As Extractor.footprint: the colours and the maps."""
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
         return Footprint(0, 0, 24 * crop_size**2 + maps, max_batch=64)  # float32 colours, twice
 
     def load(self, runtime: Runtime) -> PixelsBackbone:
-        """Nothing to load."""
+        """The spec on the runtime's device; there are no weights."""
         return PixelsBackbone(self, runtime)
 
 
@@ -54,12 +54,12 @@ class PixelsBackbone:
         self.batch = runtime.batch or compute_batch_size(footprint, runtime, self.device)
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        """Maps of the given layers, float32; a cell that is larger than its colours holds their means."""
+        """Maps of the given layers, float32; each colour is an average over its part of the cell."""
         rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
         image, side = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1, self.spec.side
-        return {layer: pixel_unshuffle(_resized(image, side * cells_of(layer)), side) for layer in layers}
+        return {layer: pixel_unshuffle(_resize(image, side * cells_of(layer)), side) for layer in layers}
 
 
-def _resized(image: torch.Tensor, size: int) -> torch.Tensor:
+def _resize(image: torch.Tensor, size: int) -> torch.Tensor:
     shrinks = size < image.shape[-1]
     return interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=shrinks)

@@ -1,6 +1,6 @@
 """crops -> feature maps of a small U-Net of Stable Diffusion's architecture with random weights: a control.
 
-It is not Stable Diffusion and has learned nothing; what it scores is what convolutions alone are worth.
+It is not Stable Diffusion and is untrained: its scores show how far random convolutions get.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Width = Annotated[int, Field(ge=_GROUPS, multiple_of=_GROUPS)]
 class RandomSD(DiffusionFeatures):
     """Random weights, drawn in memory from ``weights_seed``: a control, not Stable Diffusion.
 
-    The classes of diffusers and 12 decoder blocks as in SD; only the widths differ: ``channels`` of the U-Net's levels,
-    ``vae_channels`` of the encoder's, whose count sets the VAE's factor (3 levels: 4 pixels per latent cell).
+    Uses the same diffusers classes and 12 decoder blocks as SD, with other widths: ``channels`` of the U-Net's levels
+    and ``vae_channels`` of the encoder's. The number of encoder levels sets the VAE's factor (3: 4 px per latent cell).
     """
 
     kind: ClassVar[str] = "extract.random_sd"
@@ -61,11 +61,11 @@ class RandomSD(DiffusionFeatures):
         )
 
     def load_model(self) -> LoadedModel:
-        """The same weights on every machine and in every run."""
+        """Weights drawn from ``weights_seed``, the same on every machine."""
         dtype = getattr(torch, self.dtype)
-        unet = with_random_weights(allocate_unet(self.configs.unet, dtype), seed=self.weights_seed)
-        vae = with_random_weights(allocate_encoder(self.configs.vae, dtype), seed=self.weights_seed)
-        prompt = _gaussian("prompt", (1, _PROMPT_TOKENS, self.cross_attention_dim), seed=self.weights_seed)
+        unet = randomise_weights(allocate_unet(self.configs.unet, dtype), seed=self.weights_seed)
+        vae = randomise_weights(allocate_encoder(self.configs.vae, dtype), seed=self.weights_seed)
+        prompt = draw_gaussian("prompt", (1, _PROMPT_TOKENS, self.cross_attention_dim), seed=self.weights_seed)
         return LoadedModel(unet, vae, prompt.to(dtype))
 
 
@@ -96,23 +96,24 @@ def vae_config(channels: tuple[int, ...]) -> dict[str, Any]:
     }
 
 
-def with_random_weights(model: nn.Module, *, seed: int) -> nn.Module:
-    """A model whose weights depend on ``seed`` and their own names alone, not on the order a library makes them in.
+def randomise_weights(model: nn.Module, *, seed: int) -> nn.Module:
+    """Overwrite the model's weights; each is drawn from ``seed`` and its name, so their order does not matter.
 
-    Matrices and kernels: Gaussian of variance 1 / fan-in, which keeps the size of activations. Norms: the identity.
+    Matrices and kernels: Gaussian of variance 1 / fan-in, which preserves the scale of activations. Norms: identity.
     """
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            parameter.copy_(_initial(name, tuple(parameter.shape), seed=seed))
+            parameter.copy_(_draw_initial(name, tuple(parameter.shape), seed=seed))
     return model
 
 
-def _initial(name: str, shape: tuple[int, ...], *, seed: int) -> Tensor:
+def _draw_initial(name: str, shape: tuple[int, ...], *, seed: int) -> Tensor:
     if len(shape) > 1:
-        return _gaussian(name, shape, seed=seed) / math.prod(shape[1:]) ** 0.5
+        return draw_gaussian(name, shape, seed=seed) / math.prod(shape[1:]) ** 0.5
     return torch.ones(shape) if name.endswith("weight") else torch.zeros(shape)
 
 
-def _gaussian(name: str, shape: tuple[int, ...], *, seed: int) -> Float[Tensor, "*shape"]:
+def draw_gaussian(name: str, shape: tuple[int, ...], *, seed: int) -> Float[Tensor, "*shape"]:
+    """Unit Gaussian values that depend on ``seed`` and ``name`` alone."""
     key = int.from_bytes(sha256(f"{seed}\0{name}".encode()).digest()[:8], "little") >> 1
     return torch.randn(shape, generator=torch.Generator().manual_seed(key))

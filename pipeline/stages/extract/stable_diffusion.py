@@ -17,8 +17,8 @@ from pipeline.spec import spec
 class StableDiffusion(DiffusionFeatures):
     """Stable Diffusion 1.x or 2.x; the paper reads layers 2, 5, 8 and 11 at timestep 50.
 
-    ``weights``: a hub id (``revision`` is for it alone), a diffusers folder, or one .safetensors file of the original
-    layout. Both fields say where; the digest of the files found there stands for them in the recipe.
+    ``weights``: a hub id (with an optional ``revision``), a diffusers folder, or one .safetensors file in the original
+    layout. The recipe holds the digest of the files instead of these two fields.
     """
 
     kind: ClassVar[str] = "extract.stable_diffusion"
@@ -30,7 +30,7 @@ class StableDiffusion(DiffusionFeatures):
 
     @cached_property
     def source(self) -> Weights:
-        """The weights, found (and fetched, for a hub id). Raises BadInput."""
+        """Where the weights are; a hub id is downloaded first. Raises BadInput."""
         return open_weights(self.weights, self.revision)
 
     @cached_property
@@ -45,7 +45,7 @@ class StableDiffusion(DiffusionFeatures):
         return f"stable_diffusion-{self.weights_digest[:8]}"
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe; the weights by digest, wherever they lie."""
+        """As Spec.recipe, with the weights' digest instead of their location."""
         recipe = super().recipe() | {"weights": self.weights_digest}
         del recipe["revision"]
         return recipe
@@ -56,7 +56,7 @@ class StableDiffusion(DiffusionFeatures):
         return self.source.read_configs()
 
     def load_model(self) -> LoadedModel:
-        """Text encoder first and freed before the U-Net comes: the peak is the U-Net alone."""
+        """Weights on the CPU; the text encoder is freed before the U-Net is loaded, to keep peak memory low."""
         dtype = getattr(torch, self.dtype)
         prompt = self.source.prompt(self.prompt).to(dtype)
         return LoadedModel(self.source.unet(dtype), self.source.vae(dtype), prompt)

@@ -22,7 +22,8 @@ from pipeline.functional.camera import mask_bbox
 from pipeline.io.checkpoints import tensor_shapes
 from pipeline.io.digests import files_digest
 from pipeline.items.views import Image, Proposal
-from pipeline.spec import Fraction, Positive, PositiveFloat, Runtime, Spec, spec
+from pipeline.spec import Fraction, Positive, PositiveFloat, Runtime, spec
+from pipeline.stages.detect.proposals import Proposer
 
 POINTS_PER_BATCH = 64
 _MEAN, _STD = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32)  # of ImageNet
@@ -30,7 +31,7 @@ _BLOCK = 1 << 26  # logits enlarged at a time
 
 
 @spec
-class Sam(Spec):
+class Sam(Proposer):
     """Masks that SAM or SAM 2 finds at the points of a grid, the reliable ones, without near duplicates.
 
     ``weights``: a hub id (``revision`` is for it alone) or a folder as transformers' save_pretrained writes it, of
@@ -74,7 +75,7 @@ class Sam(Spec):
         return recipe
 
     def weight_bytes(self) -> int:
-        """What the weights take in memory."""
+        """Memory that the float32 weights take."""
         return 4 * sum(math.prod(shape) for path in self.source.tensors for shape in tensor_shapes(path).values())
 
     def load(self, runtime: Runtime) -> LoadedSam:
