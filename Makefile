@@ -48,7 +48,7 @@ demo: $(STAMP) ## poses of procedural objects in cluttered scenes, errors agains
 	$(PY) -m pipeline dataset=demo step=report $(ARGS)
 
 pictures: $(STAMP) ## the pictures of README and docs again; ARGS=--diagrams for the SVG files alone
-	$(PY) docs/pictures.py $(ARGS)
+	$(PY) -m docs.pictures $(ARGS)
 
 ablations: $(STAMP) ## the paper's ablations on the demo data; ARGS="dataset=lmo dataset.root=..." for others
 	$(PY) -m pipeline dataset=demo method=dzop $(ARGS)

@@ -1,4 +1,4 @@
-"""Draw the pictures of README.md and docs/: ``python docs/pictures.py`` or ``make pictures``.
+"""Draw the pictures of README.md and docs/: ``python -m docs.pictures`` or ``make pictures``.
 
 Photographs, overlays and cards come from runs of the product on procedural objects; diagrams are drawn here as SVG.
 Run twice on one machine, it writes the same bytes.
@@ -15,13 +15,14 @@ import tempfile
 from pathlib import Path
 
 import PIL.Image
-from diagrams import DIAGRAMS
 
-from pipeline.report.gallery import GAP_PX, PANEL_PX, TITLE_PX
+from docs.diagrams import DIAGRAMS
+from pipeline.report.panels import GAP_PX, PANEL_PX, TITLE_PX
 
 PICTURES = Path(__file__).parent / "pictures"
 PHOTOGRAPH = 2  # image of the demo's scene
 MUG = 3  # object with a handle
+MUG_XYXY = (640, 480, 1280, 960)  # the quarter of the overlay that shows it
 VIEWS = 300  # templates of an object of the demo
 MARGIN_PX = 8
 EXCERPT = ("status", "obj_id", "T_cam_obj", "score", "inliers", "correspondences", "reprojection_px")
@@ -55,7 +56,8 @@ def write_photographs(out: Path, folder: Path, *, views: int) -> None:
     save(framed(card), out / "method_narrow.jpg")
     save(framed(landscape(card)), out / "method.jpg")
     own = own_object(folder, views=2 * views)
-    save(PIL.Image.open(own / "overlays" / "000000_000000.jpg").resize((640, 480)), out / "own_object.jpg")
+    overlay = PIL.Image.open(own / "overlays" / "000000_000000.jpg")
+    save(overlay.crop(MUG_XYXY), out / "own_object.jpg")
     answer = json.loads((own / "poses.json").read_text())["answers"][0]
     (out / "own_object.json").write_text(json.dumps({name: answer[name] for name in EXCERPT}, indent=1) + "\n")
 
