@@ -11,10 +11,10 @@ from benchmarks.presets import PAPER
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
 from pipeline.graph import Context, Graph
+from pipeline.items.errors import PoseErrors
 from pipeline.items.features import CropFeatures
 from pipeline.items.online import Query, TemplateView
 from pipeline.items.poses import PoseEstimate
-from pipeline.items.scores import PoseErrors
 from pipeline.items.views import Crops, Geometry
 from pipeline.route import trace_pose
 from pipeline.scoring import Scorer

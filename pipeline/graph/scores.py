@@ -19,17 +19,10 @@ from pipeline.graph.poses import PoseNodes
 from pipeline.graph.replay import Replayer
 from pipeline.graph.templates import TemplateNodes
 from pipeline.io.digests import files_digest
+from pipeline.items.errors import PoseErrors, TemplateError
 from pipeline.items.online import Hypothesis
 from pipeline.items.poses import PoseEstimate
-from pipeline.items.records import Answer
-from pipeline.items.scores import (
-    PoseErrors,
-    TemplateError,
-    errors_from_record,
-    errors_to_record,
-    scores_from_record,
-    scores_to_record,
-)
+from pipeline.items.records import Answer, errors_from_record, errors_to_record, scores_from_record, scores_to_record
 from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
 from pipeline.scoring import SCORES_VERSION, Scorer, ScoringResult, truth_digest

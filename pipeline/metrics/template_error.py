@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.functional.rigid import rotation_angle_deg
-from pipeline.items.scores import TemplateError
+from pipeline.items.errors import TemplateError
 
 ACC_DEG = 15.0
 

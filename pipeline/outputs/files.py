@@ -11,9 +11,9 @@ from pipeline.bop.results import make_rows, write_results
 from pipeline.graph import PoseEvaluation
 from pipeline.graph.context import ImageId
 from pipeline.io.files import write_json
+from pipeline.items.errors import CORRECT_MSSD, PoseErrors
 from pipeline.items.poses import PoseEstimate
-from pipeline.items.records import Answer, answer_to_record
-from pipeline.items.scores import CORRECT_MSSD, PoseErrors, errors_to_record
+from pipeline.items.records import Answer, answer_to_record, errors_to_record
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.scores import summary_of
 

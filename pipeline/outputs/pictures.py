@@ -15,9 +15,9 @@ from typing import Literal
 
 from pipeline.graph import PoseEvaluation, Replay
 from pipeline.graph.context import ImageId
+from pipeline.items.errors import PoseErrors
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
-from pipeline.items.scores import PoseErrors
 from pipeline.outputs.files import errors_by_answer
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.gallery import Card, draw_card, pick_cases

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.graph import PoseEvaluation
+from pipeline.items.errors import TemplateError
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
-from pipeline.items.scores import TemplateError
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.run_records import Case, RunRecord, finished_run_record, run_id, write_run_record

@@ -10,7 +10,9 @@ from typing import Any, Literal
 
 from pipeline.errors import BadInput
 from pipeline.io.files import write_json
-from pipeline.items.scores import DatasetId, Scores, TemplateError, scores_from_record, scores_to_record
+from pipeline.items.errors import TemplateError
+from pipeline.items.records import scores_from_record, scores_to_record
+from pipeline.items.scores import DatasetId, Scores
 from pipeline.spec import digest
 
 FORMAT = 1

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.items.scores import PoseErrors
+from pipeline.items.errors import PoseErrors
 from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
 from pipeline.metrics.recall import (
     AverageRecall,

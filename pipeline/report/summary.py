@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.items.errors import CORRECT_MSSD, PoseErrors
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
-from pipeline.items.scores import CORRECT_MSSD, PoseErrors
 
 AnswerWithErrors = tuple[Answer, PoseErrors | None]
 """Errors are None without a pose or without ground truth."""

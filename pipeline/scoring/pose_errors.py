@@ -12,8 +12,8 @@ from pipeline.bop.dataset import Dataset
 from pipeline.bop.results import ResultRow
 from pipeline.bop.scene import GroundTruth
 from pipeline.functional.rigid import rotation_angle_deg
+from pipeline.items.errors import PoseErrors
 from pipeline.items.objects import Mesh, ObjectModel
-from pipeline.items.scores import PoseErrors
 from pipeline.metrics.pose_error import (
     add,
     adi,

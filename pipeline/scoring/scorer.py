@@ -14,7 +14,8 @@ from pipeline.bop.dataset import Dataset
 from pipeline.bop.results import ResultRow
 from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
-from pipeline.items.scores import PoseErrors, Scores
+from pipeline.items.errors import PoseErrors
+from pipeline.items.scores import Scores
 from pipeline.items.views import Target
 from pipeline.metrics.matching import match_instances, select_best_scored
 from pipeline.metrics.recall import MSPD_PX, TAUS, THETAS

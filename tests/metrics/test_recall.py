@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline.items.scores import Scores, scores_from_record, scores_to_record
+from pipeline.items.records import scores_from_record, scores_to_record
+from pipeline.items.scores import Scores
 from pipeline.metrics.bootstrap import image_index, mean_interval, paired_interval
 from pipeline.metrics.recall import (
     average_recall,

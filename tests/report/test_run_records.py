@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BadInput
-from pipeline.items.scores import DatasetId, Scores, TemplateError
+from pipeline.items.errors import TemplateError
+from pipeline.items.scores import DatasetId, Scores
 from pipeline.report.run_records import (
     Case,
     RunRecord,

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.items.scores import DatasetId, Scores, TemplateError
+from pipeline.items.errors import TemplateError
+from pipeline.items.scores import DatasetId, Scores
 from pipeline.report.run_records import RunRecord, run_id
 
 CONFIG: dict[str, Any] = {

@@ -202,7 +202,7 @@ def test_a_packed_file_does_not_fill_the_memory(tmp_path: Path):
         stream.write(b"[" + b" " * (200 << 20) + b"]")
     assert path.stat().st_size < 1 << 20
     told = refused_within(lambda: read_json(path), seconds=5, megabytes=160)
-    assert "unpack to more than" in told
+    assert "decompress to more than" in told
 
 
 def test_packed_detections_of_the_usual_kind_are_read(tmp_path: Path):
