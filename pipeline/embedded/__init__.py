@@ -1,4 +1,5 @@
-"""The small latent diffusion model that ships with the package, and how it is trained.
+"""The small latent diffusion model that ships with the package, and its training.
 
-objects -> views (shapes, views) -> pictures -> autoencoder, denoiser, descriptors (training) -> weights
+seed -> objects (shapes) -> views (views) -> pictures (surfaces, pictures) -> batches (batches)
+batches -> autoencoder, denoiser, descriptors (networks, losses, training_stages, training) -> weights (export)
 """

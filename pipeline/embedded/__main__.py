@@ -1,4 +1,7 @@
-"""``python -m pipeline.embedded``: the embedded model, from nothing to weights, as far as the time allows."""
+"""Train the embedded model from procedural objects, and replace the weights that ship once all stages are complete.
+
+The training stops after --minutes; the same command resumes it from the last checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -11,45 +14,65 @@ import torch
 from joblib import Parallel, delayed
 
 from pipeline.embedded.export import export
-from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, train
+from pipeline.embedded.plan import TrainingFolder, TrainingPlan
+from pipeline.embedded.training import train
+from pipeline.embedded.training_stages import Autoencoder, Denoiser, Descriptors
 from pipeline.embedded.views import make_shard
 
 WEIGHTS = Path(__file__).parent / "weights"
+_FIRST_SHARDS = 8
 
 
 def main() -> None:
-    """Parse, then train the stages in turn."""
+    """Parse the options and train."""
     parser = argparse.ArgumentParser(prog="python -m pipeline.embedded", description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("cache/embedded"), help="shards, checkpoints, loss curves")
-    parser.add_argument("--minutes", type=_above_zero, default=120.0, help="stop after so long; the next call goes on")
-    parser.add_argument("--scale", type=_above_zero, default=1.0, help="of the number of steps")
     parser.add_argument(
-        "--batch", type=_above_zero, default=1.0, help="of the size of batches: less on a slower machine"
+        "--folder",
+        type=Path,
+        default=Path("cache/embedded"),
+        help="for shards, checkpoints and loss curves (%(default)s)",
+    )
+    parser.add_argument("--minutes", type=_above_zero, default=120.0, help="stop after this time (%(default)g)")
+    parser.add_argument("--scale", type=_above_zero, default=1.0, help="factor on the number of steps (%(default)g)")
+    parser.add_argument(
+        "--batch",
+        type=_above_zero,
+        default=1.0,
+        help="factor on the batch size; use less on a slow machine (%(default)g)",
     )
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
-    parser.add_argument("--device", choices=devices, default=devices[-1], help="cuda where there is one")
-    parser.add_argument("--workers", type=_count, default=0, help="processes that draw batches; 0 = this one alone")
-    parser.add_argument("--threads", type=_count, default=0, help="0 = all cores")
+    parser.add_argument("--device", choices=devices, default=devices[-1], help="(%(default)s)")
+    parser.add_argument(
+        "--workers",
+        type=_count,
+        default=0,
+        help="processes that draw batches; 0: the training process does (%(default)d)",
+    )
+    parser.add_argument("--threads", type=_count, default=0, help="CPU threads of torch; 0: all cores (%(default)d)")
     run(parser.parse_args())
 
 
 def run(options: argparse.Namespace) -> None:
-    """Shards first as far as the first steps need them, then each stage; weights are replaced once all have ended."""
+    """Make shards, train the stages in turn, and export the weights if all are complete."""
     if options.threads:
         torch.set_num_threads(options.threads)
-    until, place, plan = time.time() + 60 * options.minutes, Place(options.folder), _sized(Plan(), options.batch)
-    _make_shards(place.folder / "shards", plan.shards if options.workers else 8, options.workers)
+    until = time.time() + 60 * options.minutes
+    folder, plan = TrainingFolder(options.folder), _scale_batches(TrainingPlan(), options.batch)
+    _make_shards(folder.shards, plan.shards if options.workers else _FIRST_SHARDS, options.workers)
     for kind, steps in ((Autoencoder, plan.autoencoder), (Denoiser, plan.denoiser), (Descriptors, plan.descriptors)):
-        stage = kind(plan, place, round(steps * options.scale), options.device)
-        if not train(stage, place, until=until, workers=options.workers):
-            print(f"{kind.name}: time is up; the next call goes on from here, {WEIGHTS} stays as it is")
+        stage = kind(plan, folder, round(steps * options.scale), options.device)
+        if not train(stage, folder, until=until, workers=options.workers):
+            print(f"{kind.name}: time is up. Run the same command again to resume; {WEIGHTS} is unchanged")
             return
         print(f"{kind.name}: done", flush=True)
-    print(f"{export(place, WEIGHTS) / 1e6:.1f} MB of weights in {WEIGHTS}")
+    print(f"{export(folder, WEIGHTS) / 1e6:.1f} MB of weights in {WEIGHTS}")
 
 
 def _make_shards(folder: Path, count: int, workers: int) -> None:
-    """The first shards, or with workers all of them before any is read."""
+    """Make the first ``count`` shards in parallel.
+
+    Without workers these are only the ones that the first steps read; later ones are made when they are needed.
+    """
     Parallel(n_jobs=max(workers, 1))(delayed(make_shard)(folder, index) for index in range(count))
 
 
@@ -69,8 +92,8 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _sized(plan: Plan, batch: float) -> Plan:
-    pictures, objects = max(round(batch * plan.pictures), 1), max(round(batch * plan.objects), 1)
+def _scale_batches(plan: TrainingPlan, factor: float) -> TrainingPlan:
+    pictures, objects = max(round(factor * plan.pictures), 1), max(round(factor * plan.objects), 1)
     return replace(plan, pictures=pictures, objects=objects)
 
 

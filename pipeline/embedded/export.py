@@ -1,4 +1,4 @@
-"""checkpoints -> the weights that ship: float16 safetensors, with the configs they belong to."""
+"""Checkpoints -> the weights that ship: float16 safetensors, their configuration, samples of the loss curves."""
 
 from __future__ import annotations
 
@@ -10,55 +10,59 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from pipeline.embedded.training import UNET, VAE, Place
+from pipeline.embedded.networks import UNET, VAE
+from pipeline.embedded.plan import TrainingFolder
 from pipeline.io.files import write_atomic
 
-MOST_BYTES = 25_000_000
+MAX_BYTES = 25_000_000
 SCHEDULER = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 
 
-def export(place: Place, folder: Path) -> int:
-    """Write the averages of all stages that have a checkpoint; returns the bytes written."""
-    made: dict[str, bytes] = {}
-    autoencoder = _saved(place, "autoencoder")
+def export(training: TrainingFolder, folder: Path) -> int:
+    """Write the averaged weights of all stages that have a checkpoint; returns the number of bytes.
+
+    Raises ValueError for more than MAX_BYTES.
+    """
+    files: dict[str, bytes] = {}
+    autoencoder = _load_checkpoint(training, "autoencoder")
     if autoencoder is not None:
-        made["vae.safetensors"] = _half(autoencoder["average"])
+        files["vae.safetensors"] = _to_half_safetensors(autoencoder["average"])
         config = {"unet": UNET, "vae": VAE | {"scaling_factor": autoencoder["scaling_factor"]}, "scheduler": SCHEDULER}
-        made["config.json"] = (json.dumps(config, indent=1) + "\n").encode()
-    denoiser = _saved(place, "denoiser")
+        files["config.json"] = (json.dumps(config, indent=1) + "\n").encode()
+    denoiser = _load_checkpoint(training, "denoiser")
     if denoiser is not None:
-        made["unet_pure.safetensors"] = _half(denoiser["average"])
-    described = _saved(place, "descriptors")
-    if described is not None:
-        made["unet_learned.safetensors"] = _half(_below("unet.", described["average"]))
-        made["head.safetensors"] = _half(_below("head.", described["average"]))
-    curves = {stage: _curve(place, stage) for stage in ("autoencoder", "denoiser", "descriptors")}
-    made["losses.json"] = (json.dumps(curves) + "\n").encode()
-    size = sum(map(len, made.values()))
-    if size > MOST_BYTES:
-        raise ValueError(f"{size} bytes of weights, at most {MOST_BYTES} may ship")
-    for name, content in made.items():
+        files["unet_pure.safetensors"] = _to_half_safetensors(denoiser["average"])
+    descriptors = _load_checkpoint(training, "descriptors")
+    if descriptors is not None:
+        files["unet_learned.safetensors"] = _to_half_safetensors(_select_prefix("unet.", descriptors["average"]))
+        files["head.safetensors"] = _to_half_safetensors(_select_prefix("head.", descriptors["average"]))
+    curves = {stage: _sample_curve(training, stage) for stage in ("autoencoder", "denoiser", "descriptors")}
+    files["losses.json"] = (json.dumps(curves) + "\n").encode()
+    size = sum(map(len, files.values()))
+    if size > MAX_BYTES:
+        raise ValueError(f"found {size} bytes of weights, needs at most {MAX_BYTES}")
+    for name, content in files.items():
         write_atomic(folder / name, content)
     return size
 
 
-def _curve(place: Place, stage: str) -> list[dict[str, float]]:
-    """Losses of the first steps, of every 25th and of the last: a repeated training can be held against them."""
-    path = place.curve(stage)
+def _sample_curve(training: TrainingFolder, stage: str) -> list[dict[str, float]]:
+    """Losses of the first 20 steps, every 25th and the last, to compare a repeated training with."""
+    path = training.curve(stage)
     records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     kept = [record for record in records if record["step"] < 20 or record["step"] % 25 == 0] + records[-1:]
-    by_step = {record["step"]: record for record in kept}  # steps after a checkpoint that was gone back to come twice
+    by_step = {record["step"]: record for record in kept}  # a resumed training logs some steps twice
     return [{name: value for name, value in record.items() if name != "at"} for record in by_step.values()]
 
 
-def _saved(place: Place, stage: str) -> dict[str, Any] | None:
-    path = place.checkpoint(stage)
-    return torch.load(path, map_location="cpu", weights_only=True) if path.exists() else None
+def _load_checkpoint(training: TrainingFolder, stage: str) -> dict[str, Any] | None:
+    exists = training.checkpoint(stage).exists()
+    return training.load_checkpoint(stage, torch.device("cpu")) if exists else None
 
 
-def _below(prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
+def _select_prefix(prefix: str, state: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
 
 
-def _half(state: dict[str, Tensor]) -> bytes:
+def _to_half_safetensors(state: dict[str, Tensor]) -> bytes:
     return save({name: tensor.half().contiguous() for name, tensor in state.items()})

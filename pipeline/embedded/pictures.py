@@ -1,4 +1,4 @@
-"""views -> pictures: templates as the pipeline draws them, and photographs of every kind of badness."""
+"""Views -> pictures: templates as the pipeline renders them, and photographs of varying quality."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.embedded.views import NOTHING, SIZE
+from pipeline.embedded.views import EMPTY_DEPTH, SIZE
 from pipeline.functional.camera import mask_bbox, square_crop
 from pipeline.functional.shading import shade
 from pipeline.synthetic.parts import Rng
 
-AMBIENT, DIFFUSE = 0.45, 0.55  # of templates: conf/render
-_LEAST_SEEN = 0.3  # of the silhouette, whatever hides the rest
+AMBIENT, DIFFUSE = 0.45, 0.55  # of templates, as in conf/render
+_MIN_VISIBLE = 0.3  # share of the silhouette that stays visible
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One view of ``views.Views``."""
+    """One view: albedo, normals (camera frame) and depth, from which it can be rendered under any light."""
 
     albedo: UInt8[np.ndarray, "S S 3"]
     normal: Float32[np.ndarray, "S S 3"]
@@ -30,21 +30,27 @@ class View:
     @property
     def mask(self) -> Bool[np.ndarray, "S S"]:
         """Pixels that show the object."""
-        return self.depth > NOTHING / 2
+        return self.depth > EMPTY_DEPTH / 2
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A crop as the extractor gets it. ``seen``: pixels of the view that it shows; A_crop_view takes them there."""
+    """A crop as the extractor receives it.
+
+    ``visible``: pixels of the view that it shows. ``A_crop_view`` takes pixels of the view to pixels of the crop.
+    """
 
     rgb: UInt8[np.ndarray, "S S 3"]
     mask: Bool[np.ndarray, "S S"]
-    seen: Bool[np.ndarray, "S S"]
+    visible: Bool[np.ndarray, "S S"]
     A_crop_view: Float[np.ndarray, "3 3"]
 
 
-def template(view: View, rng: Rng) -> Picture:
-    """As render and crop draw it: one headlight, black ground; a little softer on some, as supersampled ones are."""
+def render_template(view: View, rng: Rng) -> Picture:
+    """The view as render and crop show it: light at the camera, black background.
+
+    Half of the templates are slightly blurred, as supersampled ones are.
+    """
     rays = _rays(view)
     colour = shade(view.albedo.astype(np.float32), view.normal, rays, ambient=AMBIENT, diffuse=DIFFUSE)
     if rng.uniform() < 0.5:
@@ -53,27 +59,27 @@ def template(view: View, rng: Rng) -> Picture:
     return Picture(rgb, view.mask, view.mask, np.eye(3))
 
 
-def photograph(view: View, rng: Rng, *, other: View | None = None) -> Picture:
-    """Another light, camera and crop; hidden in part, small, blurred, noisy, its mask not quite right.
+def render_photograph(view: View, rng: Rng, *, other: View | None = None) -> Picture:
+    """The view under random light and camera: partly hidden, small, blurred, noisy, with an imprecise mask.
 
-    How bad it is varies from nearly perfect to hardly legible: what can be placed exactly has to be placed exactly.
-    ``other`` shows an object that may stand before this one; with it come shadows and worse masks.
+    Quality varies from nearly perfect to hardly recognisable. ``other``: a view of an object that may occlude this one;
+    with it, pictures also have shadows and worse masks.
     """
     rough = float(rng.uniform())
-    colour, ground = _relit(view, rng, shadows=other is not None), _ground(rng)
-    seen = view.mask
+    colour, background = _relight(view, rng, shadows=other is not None), _random_background(rng)
+    visible = view.mask
     if rng.uniform() < (0.5 if other is None else 0.25):
-        seen = _hidden(view.mask, rng)
+        visible = _hide_part(view.mask, rng)
     elif other is not None and rng.uniform() < 0.4:
-        seen, ground = _behind(view.mask, ground, other, rng)
-    colour = np.where(seen[..., None], colour, ground)
-    badly = (rough, 0.35) if other is None else (0.2 + 0.8 * rough, 0.5)
-    mask = _wrong_mask(seen, rng, by_a_piece=badly[1]) if rng.uniform() < badly[0] else seen
+        visible, background = _hide_behind(view.mask, background, other, rng)
+    colour = np.where(visible[..., None], colour, background)
+    mask_faults = (rough, 0.35) if other is None else (0.2 + 0.8 * rough, 0.5)
+    mask = _distort_mask(visible, rng, piece_probability=mask_faults[1]) if rng.uniform() < mask_faults[0] else visible
     box = mask_bbox(mask)
     assert box is not None
     A_crop_view = square_crop(box, size=SIZE, padding_ratio=1.2)
-    rgb, cropped = _taken(colour, mask, A_crop_view, rough, rng)
-    return Picture(rgb, cropped, seen & mask, A_crop_view)
+    rgb, cropped = _degrade(colour, mask, A_crop_view, rough, rng)
+    return Picture(rgb, cropped, visible & mask, A_crop_view)
 
 
 def _rays(view: View) -> Float32[np.ndarray, "S S 3"]:
@@ -82,8 +88,8 @@ def _rays(view: View) -> Float32[np.ndarray, "S S 3"]:
     return np.stack([*np.meshgrid(x, y), np.ones((SIZE, SIZE), np.float32)], axis=-1)
 
 
-def _relit(view: View, rng: Rng, *, shadows: bool) -> Float32[np.ndarray, "S S 3"]:
-    """Lambert under one or two lights with gloss; colours, white balance, exposure and contrast of another camera."""
+def _relight(view: View, rng: Rng, *, shadows: bool) -> Float32[np.ndarray, "S S 3"]:
+    """Lambert shading with gloss under one or two lights, with random colours, white balance, exposure and contrast."""
     albedo = view.albedo.astype(np.float32)
     grey = albedo.mean(axis=-1, keepdims=True)
     albedo = grey + (albedo - grey) * rng.uniform(0.2, 1.3)
@@ -98,15 +104,15 @@ def _relit(view: View, rng: Rng, *, shadows: bool) -> Float32[np.ndarray, "S S 3
         shine = shine + strength * lobe ** rng.uniform(8, 50)
     colour = albedo * np.asarray(shade)[..., None] + 255 * gloss * np.asarray(shine)[..., None]
     if shadows and rng.uniform() < 0.6:
-        colour = colour * _shadows(view, rng)[..., None]
+        colour = colour * _random_shadows(view, rng)[..., None]
     tint = rng.uniform(0.8, 1.2, 3) * np.exp(rng.uniform(-0.6, 0.35))
     colour = np.clip(colour * tint, 0, 255) / 255
-    lifted = colour ** np.exp(rng.uniform(-0.4, 0.4)) * (1 - rng.uniform(0, 0.12)) + rng.uniform(0, 0.1)
-    return (255 * lifted).astype(np.float32)
+    toned = colour ** np.exp(rng.uniform(-0.4, 0.4)) * (1 - rng.uniform(0, 0.12)) + rng.uniform(0, 0.1)
+    return (255 * toned).astype(np.float32)
 
 
-def _shadows(view: View, rng: Rng) -> Float32[np.ndarray, "S S"]:
-    """What hollows lose, and what something outside the picture takes from a part of it, with a soft edge."""
+def _random_shadows(view: View, rng: Rng) -> Float32[np.ndarray, "S S"]:
+    """Factors of ambient occlusion in hollows and of soft shadows cast from outside the picture."""
     mask = view.mask.astype(np.float32)
     sigma = rng.uniform(2, 10)
     near = np.where(view.mask, view.depth, 0).astype(np.float32)
@@ -118,16 +124,16 @@ def _shadows(view: View, rng: Rng) -> Float32[np.ndarray, "S S"]:
     return ((1 - hollow) * (1 - rng.uniform(0, 0.65) * cast)).astype(np.float32)
 
 
-def _ground(rng: Rng) -> Float32[np.ndarray, "S S 3"]:
-    """What stands behind and before the object: blotches of colour, smooth or sharp."""
+def _random_background(rng: Rng) -> Float32[np.ndarray, "S S 3"]:
+    """A random background of colour blotches, smooth or sharp."""
     steps = int(rng.integers(2, 24))
     blotches = rng.uniform(0, 255, 3) + rng.normal(0, 60, (steps, steps, 1)) + rng.normal(0, 25, (steps, steps, 3))
     how = cv2.INTER_CUBIC if rng.uniform() < 0.6 else cv2.INTER_NEAREST
     return np.clip(cv2.resize(blotches.astype(np.float32), (SIZE, SIZE), interpolation=how), 0, 255)
 
 
-def _hidden(mask: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
-    """The silhouette less a half plane, an ellipse or a polygon; less and less is hidden until enough is seen."""
+def _hide_part(mask: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
+    """The silhouette minus a half-plane, an ellipse or a polygon, shrunk until enough is visible."""
     centre = np.argwhere(mask)[rng.integers(mask.sum())][::-1].astype(float)
     kind, size, angle = rng.integers(3), rng.uniform(15, 60), rng.uniform(0, 2 * np.pi)
     corners = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 8))))
@@ -143,54 +149,56 @@ def _hidden(mask: Bool[np.ndarray, "S S"], rng: Rng) -> Bool[np.ndarray, "S S"]:
         else:
             outline = centre + size * shrink * np.stack([np.cos(corners), np.sin(corners)], -1)
             cv2.fillPoly(cover, [np.rint(outline).astype(np.int32)], 1)
-        seen = mask & (cover == 0)
-        if seen.sum() >= max(_LEAST_SEEN * mask.sum(), 60):
-            return seen
+        visible = mask & (cover == 0)
+        if visible.sum() >= max(_MIN_VISIBLE * mask.sum(), 60):
+            return visible
     return mask
 
 
-def _behind(
-    mask: Bool[np.ndarray, "S S"], ground: Float32[np.ndarray, "S S 3"], other: View, rng: Rng
+def _hide_behind(
+    mask: Bool[np.ndarray, "S S"], background: Float32[np.ndarray, "S S 3"], other: View, rng: Rng
 ) -> tuple[Bool[np.ndarray, "S S"], Float32[np.ndarray, "S S 3"]]:
-    """The silhouette less another object's before it, and the ground with that object on it."""
-    colour = _relit(other, rng, shadows=True)
+    """The silhouette minus that of another object in front of it, and the background with that object."""
+    colour = _relight(other, rng, shadows=True)
     at = np.argwhere(mask)[rng.integers(mask.sum())][::-1].astype(float)
     angle, grown = rng.uniform(0, 360), rng.uniform(0.35, 1.3)
     for shrink in (1.0, 0.7, 0.45, 0.25):
         A = cv2.getRotationMatrix2D((SIZE / 2, SIZE / 2), angle, grown * shrink)
         A[:, 2] += at + rng.normal(0, 8, 2) - SIZE / 2
         cover = cv2.warpAffine(other.mask.astype(np.uint8), A, (SIZE, SIZE), flags=cv2.INTER_NEAREST) > 0
-        seen = mask & ~cover
-        if seen.sum() >= max(_LEAST_SEEN * mask.sum(), 60):
+        visible = mask & ~cover
+        if visible.sum() >= max(_MIN_VISIBLE * mask.sum(), 60):
             moved = cv2.warpAffine(colour, A, (SIZE, SIZE), flags=cv2.INTER_LINEAR)
-            return seen, np.where(cover[..., None], moved, ground)
-    return mask, ground
+            return visible, np.where(cover[..., None], moved, background)
+    return mask, background
 
 
-def _wrong_mask(seen: Bool[np.ndarray, "S S"], rng: Rng, *, by_a_piece: float) -> Bool[np.ndarray, "S S"]:
-    """The outline wavers; on a share of them, a piece is missing or something else belongs to it."""
+def _distort_mask(visible: Bool[np.ndarray, "S S"], rng: Rng, *, piece_probability: float) -> Bool[np.ndarray, "S S"]:
+    """A mask with a distorted outline; with ``piece_probability``, a part is also missing or added."""
     steps = int(rng.integers(3, 20))
-    waver = cv2.resize(rng.normal(size=(steps, steps)).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
-    soft = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), rng.uniform(1, 5))
-    mask = soft + rng.uniform(0.02, 0.25) * waver > rng.uniform(0.35, 0.65)
-    if rng.uniform() < by_a_piece:
-        at = np.argwhere(cv2.Canny(seen.astype(np.uint8) * 255, 50, 150) > 0)
+    distortion = cv2.resize(
+        rng.normal(size=(steps, steps)).astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC
+    )
+    soft = cv2.GaussianBlur(visible.astype(np.float32), (0, 0), rng.uniform(1, 5))
+    mask = soft + rng.uniform(0.02, 0.25) * distortion > rng.uniform(0.35, 0.65)
+    if rng.uniform() < piece_probability:
+        at = np.argwhere(cv2.Canny(visible.astype(np.uint8) * 255, 50, 150) > 0)
         piece = np.zeros(mask.shape, np.uint8)
         y, x = at[rng.integers(len(at))] if len(at) else (SIZE // 2, SIZE // 2)
         axes = (int(rng.integers(4, 28)), int(rng.integers(4, 28)))
         cv2.ellipse(piece, (int(x), int(y)), axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
         mask = mask | (piece > 0) if rng.uniform() < 0.5 else mask & (piece == 0)
-    return mask if (mask & seen).sum() >= 0.5 * seen.sum() else seen
+    return mask if (mask & visible).sum() >= 0.5 * visible.sum() else visible
 
 
-def _taken(
+def _degrade(
     colour: Float32[np.ndarray, "S S 3"],
     mask: Bool[np.ndarray, "S S"],
     A_crop_view: Float[np.ndarray, "3 3"],
     rough: float,
     rng: Rng,
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"]]:
-    """The crop of a camera that gives it few pixels: shrunk, blurred, noisy, compressed, masked and enlarged again."""
+    """The crop as from a low-resolution camera: downscaled, blurred, noisy, compressed, masked, enlarged again."""
     side = int(SIZE * (28 / SIZE) ** (rough * rng.uniform()))
     A = np.array([[side / SIZE, 0, 0.5 * side / SIZE - 0.5], [0, side / SIZE, 0.5 * side / SIZE - 0.5], [0, 0, 1]])
     A = A @ A_crop_view

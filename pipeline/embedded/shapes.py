@@ -1,7 +1,7 @@
-"""seed -> an object to train on: assemblies of revolve, extruded, bent, bumpy, box-like parts, mostly of plain colour.
+"""seed -> an object to train on: assemblies of revolved, extruded, bent, bumpy or box-like parts.
 
-Wider than ``synthetic.objects``, whose objects the benchmark uses: symmetric ones, hollow ones and thin ones are among
-these, and so are objects of a single colour.
+The variety is larger than in ``synthetic.objects``, which the benchmark uses: some objects are symmetric, hollow or
+thin, and many have a single colour.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ Points = Float[np.ndarray, "v 3"]
 
 
 def make_training_object(seed: int) -> Mesh:
-    """A mesh centred on its bounding box, its farthest vertex at distance 1, with vertex colours."""
+    """A mesh with vertex colours; the origin is the centre of its bounding box, its farthest vertex at distance 1."""
     rng = np.random.default_rng([seed, 0x7EA1])
     parts = _assembly(rng)
     vertices = np.concatenate([points for points, _ in parts])
     part = np.repeat(np.arange(len(parts)), [len(points) for points, _ in parts])
     offsets = np.cumsum([0] + [len(points) for points, _ in parts[:-1]])
     faces = np.concatenate([part_faces + offset for (_, part_faces), offset in zip(parts, offsets, strict=True)])
-    vertices = _bent(vertices, rng) @ random_rotation(rng).T
+    vertices = _bend(vertices, rng) @ random_rotation(rng).T
     vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     vertices /= np.linalg.norm(vertices, axis=-1).max()
-    return Mesh(vertices, faces, colours=_colours(vertices, part, rng), digest=f"training object {seed}")
+    return Mesh(vertices, faces, colours=_paint(vertices, part, rng), digest=f"training object {seed}")
 
 
 def _assembly(rng: Rng) -> list[Shape]:
-    """One family, or two grown into each other."""
+    """Parts of one family, or of two families that intersect."""
     parts = _FAMILIES[rng.integers(len(_FAMILIES))](rng)
     if rng.uniform() < 0.35:
         size, turn = rng.uniform(0.3, 0.9), random_rotation(rng)
@@ -61,7 +61,7 @@ def _blob(rng: Rng) -> list[Shape]:
 
 
 def _figure(rng: Rng) -> list[Shape]:
-    """A body with smaller rounded parts on it, some of them in mirrored pairs: animals, toys."""
+    """A body with smaller rounded parts, some of them in mirrored pairs: animals, toys."""
     size = rng.uniform(0.5, 1.1, 3)
     parts = [_lump(rng, size)]
     for _ in range(int(rng.integers(2, 6))):
@@ -79,8 +79,8 @@ def _lump(rng: Rng, size: Float[np.ndarray, " 3"]) -> Shape:
     return points * bumps[:, None], faces
 
 
-def _turning(rng: Rng) -> list[Shape]:
-    """A turned body, some hollow, with handles or spouts on some."""
+def _revolved(rng: Rng) -> list[Shape]:
+    """A surface of revolution, sometimes hollow, sometimes with handles or spouts: bottles, cans, jugs."""
     rows = 60
     height = np.linspace(-1, 1, rows) * rng.uniform(0.4, 1.2)
     along = np.stack([np.linspace(-1, 1, rows), np.zeros(rows), np.zeros(rows)], -1)
@@ -88,7 +88,7 @@ def _turning(rng: Rng) -> list[Shape]:
     if rng.uniform() < 0.4:  # steps, as of cans and bottles
         profile = np.where(np.linspace(0, 1, rows) > rng.uniform(0.5, 0.9), profile * rng.uniform(0.3, 0.8), profile)
     profile = np.maximum(profile, 0.12)
-    if rng.uniform() < 0.4:  # the wall goes up outside and down again inside
+    if rng.uniform() < 0.4:  # hollow: the profile goes up outside and down inside
         height = np.concatenate([height, height[::-1][:-4]])
         profile = np.concatenate([profile, np.maximum(profile[::-1][:-4] - 0.08, 0.05)])
     segments = int(rng.choice([6, 8, 48, 48]))
@@ -109,7 +109,7 @@ def _handle(rng: Rng, reach: float, span: float) -> Shape:
 
 
 def _extrusion(rng: Rng) -> list[Shape]:
-    """A lobed, polygonal or toothed outline, extruded, tapered and twisted, with a boss on some."""
+    """A lobed or polygonal outline, extruded, tapered and sometimes twisted, with up to two bosses."""
     segments, rows = 96, 24
     angle = 2 * np.pi * np.arange(segments) / segments
     outline = 0.7 + sum(rng.normal(0, 0.22 / k) * np.cos(k * angle + rng.uniform(0, 2 * np.pi)) for k in range(1, 7))
@@ -132,7 +132,7 @@ def _extrusion(rng: Rng) -> list[Shape]:
 
 
 def _machine(rng: Rng) -> list[Shape]:
-    """Blocks and cylinders on and beside a block: tools, housings, brackets."""
+    """Blocks and cylinders attached to a block: tools, housings, brackets."""
     size = rng.uniform(0.2, 1.0, 3)
     parts = [superquadric(rng, size, roundness=float(rng.uniform(0.1, 0.4)))]
     for _ in range(int(rng.integers(1, 6))):
@@ -150,7 +150,7 @@ def _machine(rng: Rng) -> list[Shape]:
 
 
 def _bar(rng: Rng) -> list[Shape]:
-    """A bar of lobed section that twists, bends and thickens: bananas, handles, shells."""
+    """A bar with a lobed cross-section that twists, bends and thickens: bananas, handles, shells."""
     rows, segments = 60, 40
     along = np.linspace(0, 1, rows)
     angle = 2 * np.pi * np.arange(segments) / segments
@@ -164,7 +164,7 @@ def _bar(rng: Rng) -> list[Shape]:
 
 
 def _relief(rng: Rng) -> list[Shape]:
-    """A slab whose top carries rows of bumps, dents or steps: boxes, trays, keyboards."""
+    """A slab with rows of bumps, dents or steps on top: boxes, trays, keyboards."""
     points, faces = superquadric(rng, np.array([1.0, rng.uniform(0.4, 1.0), 1.0]), roundness=0.12, level=4)
     kx, ky = rng.uniform(2, 12, 2)
     bumps = np.sin(kx * points[:, 0] + rng.uniform(0, 6)) * np.sin(ky * points[:, 1] + rng.uniform(0, 6))
@@ -176,7 +176,7 @@ def _relief(rng: Rng) -> list[Shape]:
 
 
 def _pipes(rng: Rng) -> list[Shape]:
-    """Bent rods in one another: hooks, frames, taps."""
+    """Intersecting bent rods: hooks, frames, taps."""
     parts = []
     for _ in range(int(rng.integers(1, 4))):
         t = np.linspace(0, 1, 40)
@@ -187,12 +187,12 @@ def _pipes(rng: Rng) -> list[Shape]:
 
 
 _FAMILIES: tuple[Callable[[Rng], list[Shape]], ...] = (
-    _blob, _figure, _figure, _turning, _turning, _extrusion, _machine, _machine, _bar, _relief, _pipes
+    _blob, _figure, _figure, _revolved, _revolved, _extrusion, _machine, _machine, _bar, _relief, _pipes
 )  # fmt: skip
 
 
-def _bent(points: Points, rng: Rng) -> Points:
-    """Stretched along its axes and, one in two, bent and tapered along the first."""
+def _bend(points: Points, rng: Rng) -> Points:
+    """Stretch along the axes; half of the objects are also bent and tapered along the first."""
     points = points * rng.uniform(0.6, 1.4, 3)
     if rng.uniform() < 0.5:
         return points
@@ -201,9 +201,9 @@ def _bent(points: Points, rng: Rng) -> Points:
     return points * (1 + rng.uniform(-0.4, 0.4) * x) + shear * np.abs(points).max()
 
 
-def _colours(points: Points, part: Int[np.ndarray, " v"], rng: Rng) -> UInt8[np.ndarray, "v 3"]:
-    """One colour, one for each part, regions, or a pattern; under dirt and, on some, light baked in as in scans."""
-    palette = np.array([_colour(rng) for _ in range(8)])
+def _paint(points: Points, part: Int[np.ndarray, " v"], rng: Rng) -> UInt8[np.ndarray, "v 3"]:
+    """One colour, one per part, regions or a pattern; with dirt and sometimes baked-in light, as in scans."""
+    palette = np.array([_random_colour(rng) for _ in range(8)])
     style = rng.choice(["plain", "parts", "regions", "pattern"], p=[0.4, 0.25, 0.2, 0.15])
     index = np.zeros(len(points), dtype=int)
     if style == "parts":
@@ -223,8 +223,8 @@ def _colours(points: Points, part: Int[np.ndarray, " v"], rng: Rng) -> UInt8[np.
     return np.clip(palette[index] * (dirt * baked)[:, None], 0, 255).astype(np.uint8)
 
 
-def _colour(rng: Rng) -> Float[np.ndarray, " 3"]:
-    """Grey, dull or bright (0..255)."""
+def _random_colour(rng: Rng) -> Float[np.ndarray, " 3"]:
+    """A random grey, dull or saturated colour (0..255)."""
     hue, value = rng.uniform(), rng.uniform(0.15, 1.0)
     saturation = rng.choice([0.0, rng.uniform(0, 0.4), rng.uniform(0.4, 1.0)])
     pure = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)

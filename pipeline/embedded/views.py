@@ -1,7 +1,7 @@
-"""objects -> what is seen of them from clusters of views, in shards on disk.
+"""Objects -> clusters of views, stored in shards on disk.
 
-A view is kept as albedo, normals and depth, not as a picture: any of them can be drawn as a template is, or under
-any other light, and every cell's object point is known.
+A view is stored as albedo, normals and depth instead of a picture: it can then be rendered as a template or under any
+light, and the object point of every cell is known.
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ from pipeline.stages.render.raycast import surface_points
 from pipeline.synthetic.parts import Rng, random_direction, random_rotation
 
 SIZE = 128
-NOTHING = -100.0
+EMPTY_DEPTH = -100.0
 RINGS_DEG = ((0, 10), (8, 20), (15, 35), (30, 60))
 VIEWS = len(RINGS_DEG) + 3
-"""A cluster: the query's view, one in each ring of angles around it, a half turn of it, and any other."""
+"""Views per cluster: the query's, one in each ring of angles around it, a half-turn of it, and a random one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Clusters of ``VIEWS`` views of objects of radius 1. Normals (camera frame) times 127; depth NOTHING off them."""
+    """Clusters of ``VIEWS`` views of objects of radius 1.
+
+    Normals (camera frame) are multiplied by 127. Depth is relative to the object's centre; background: EMPTY_DEPTH.
+    """
 
     albedo: UInt8[np.ndarray, "n v S S 3"]
     normal: Int8[np.ndarray, "n v S S 3"]
@@ -55,7 +58,7 @@ _SHARD = np.dtype(
 
 
 def write_shard(path: Path, seeds: range, *, clusters: int) -> None:
-    """Views of the objects of ``seeds``; a shard that is there is kept, one that was cut short is made anew."""
+    """Write views of the objects of ``seeds`` atomically; an existing shard is kept."""
     if path.exists():
         return
     found = [cluster for seed in seeds for cluster in object_clusters(seed, clusters=clusters)]
@@ -65,34 +68,34 @@ def write_shard(path: Path, seeds: range, *, clusters: int) -> None:
 
 
 def read_shard(path: Path) -> Views:
-    """A shard, mapped into memory: processes that read it share what they read."""
+    """A memory-mapped shard: processes that read it share its pages."""
     stored = np.load(path, mmap_mode="r")
     return Views(*(np.asarray(stored[name]) for name in _SHARD.names or ()))
 
 
 def object_clusters(seed: int, *, clusters: int) -> Iterator[tuple[np.ndarray, ...]]:
-    """Clusters of one object's views as arrays in the order of the fields of Views."""
+    """Clusters of views of one object, as arrays in the order of the fields of Views."""
     mesh, rng = make_training_object(seed), np.random.default_rng([seed, 0x71E3])
     for _ in range(clusters):
-        views = [_view(mesh, R, rng) for R in _rotations(rng)]
+        views = [_render_view(mesh, R, rng) for R in _cluster_rotations(rng)]
         yield tuple(np.stack(parts) for parts in zip(*views, strict=True))
 
 
-def _rotations(rng: Rng) -> list[Float[np.ndarray, "3 3"]]:
-    """R_cam_obj of a cluster."""
+def _cluster_rotations(rng: Rng) -> list[Float[np.ndarray, "3 3"]]:
+    """R_cam_obj of the views of a cluster."""
     query = random_rotation(rng)
-    near = [_turn(random_direction(rng) * np.radians(rng.uniform(*ring))) @ query for ring in RINGS_DEG]
+    near = [_rotation(random_direction(rng) * np.radians(rng.uniform(*ring))) @ query for ring in RINGS_DEG]
     axis = np.pi * np.eye(3)[rng.integers(3)]
-    flipped = _turn(random_direction(rng) * np.radians(rng.uniform(0, 15))) @ _turn(axis) @ query
+    flipped = _rotation(random_direction(rng) * np.radians(rng.uniform(0, 15))) @ _rotation(axis) @ query
     return [query, *near, flipped, random_rotation(rng)]
 
 
-def _turn(rotvec: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def _rotation(rotvec: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     return np.asarray(cv2.Rodrigues(rotvec)[0])
 
 
-def _view(mesh: Mesh, R: Float[np.ndarray, "3 3"], rng: Rng) -> tuple[np.ndarray, ...]:
-    """One view, drawn straight into the crop that the pipeline would cut out."""
+def _render_view(mesh: Mesh, R: Float[np.ndarray, "3 3"], rng: Rng) -> tuple[np.ndarray, ...]:
+    """One view, rendered directly into the crop that the pipeline would cut."""
     T = rigid(R, np.array([*rng.normal(0, 0.4, 2), rng.uniform(6, 14)]))
     wide = np.array([[1000.0, 0, 0], [0, 1000.0, 0], [0, 0, 1]])
     px = project(wide, transform(T, mesh.vertices))
@@ -100,7 +103,7 @@ def _view(mesh: Mesh, R: Float[np.ndarray, "3 3"], rng: Rng) -> tuple[np.ndarray
     K = square_crop(box, size=SIZE, padding_ratio=1.2) @ wide
     px, albedo, normal, depth = surface_points(mesh, K, T, (SIZE, SIZE))
     maps = np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros((SIZE, SIZE, 3), np.int8)
-    near = np.full((SIZE, SIZE), NOTHING, np.float16)
+    near = np.full((SIZE, SIZE), EMPTY_DEPTH, np.float16)
     x, y = px.T
     maps[0][y, x], maps[1][y, x] = np.rint(albedo), np.rint(127 * normal)
     near[y, x] = depth - T[2, 3]
@@ -112,12 +115,12 @@ OBJECTS_PER_SHARD, CLUSTERS_PER_OBJECT = 10, 4
 
 
 def shard_path(folder: Path, index: int, *, validation: bool = False) -> Path:
-    """Where a shard lies."""
+    """File of a shard."""
     return folder / f"{'validation' if validation else 'training'}_{index:04d}.npy"
 
 
 def make_shard(folder: Path, index: int, *, validation: bool = False) -> Path:
-    """A shard of training or validation objects; made when it is not there."""
+    """Path of a shard of training or validation objects, which is made if it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
     first = (VALIDATION_SEEDS if validation else TRAINING_SEEDS) + index * OBJECTS_PER_SHARD
     path = shard_path(folder, index, validation=validation)

@@ -1,4 +1,4 @@
-"""The training command keeps what ships until it has something whole to put in its place."""
+"""The training command replaces the weights that ship only once training is complete."""
 
 import argparse
 
@@ -20,13 +20,13 @@ def test_weights_are_replaced_only_once_every_stage_has_ended(monkeypatch, tmp_p
     command.run(argparse.Namespace(folder=tmp_path, **options))
     assert asked == (["autoencoder", "denoiser", "descriptors"] if ended else ["autoencoder"])
     assert exported == ([True] if ended else [])
-    assert ("stays as it is" in capsys.readouterr().out) is not ended
+    assert ("is unchanged" in capsys.readouterr().out) is not ended
 
 
 @pytest.mark.parametrize(
     "asked", [["--device", "tpu"], ["--workers", "-1"], ["--batch", "0"], ["--scale", "nan"], ["--minutes", "x"]]
 )
-def test_a_wrong_option_is_told_by_name(monkeypatch, capsys, asked):
+def test_a_wrong_option_is_named(monkeypatch, capsys, asked):
     monkeypatch.setattr("sys.argv", ["pipeline.embedded", *asked])
     with pytest.raises(SystemExit) as ended:
         command.main()

@@ -11,12 +11,14 @@ import torch
 
 from pipeline.embedded import losses, views
 from pipeline.embedded.batches import CELLS, QUERIES, TEMPLATES, Source, pair_batch, picture_batch
-from pipeline.embedded.dressing import scanned
 from pipeline.embedded.export import export
-from pipeline.embedded.training import Autoencoder, Denoiser, Descriptors, Place, Plan, batches, train
+from pipeline.embedded.plan import TrainingFolder, TrainingPlan
+from pipeline.embedded.surfaces import imitate_scan
+from pipeline.embedded.training import iterate_batches, train
+from pipeline.embedded.training_stages import Autoencoder, Denoiser, Descriptors
 from pipeline.embedded.views import CLUSTERS_PER_OBJECT
 
-PLAN = Plan(shards=1, autoencoder=3, denoiser=2, descriptors=2, easy=1, pictures=4, noises=2, objects=1)
+PLAN = TrainingPlan(shards=1, autoencoder=3, denoiser=2, descriptors=2, easy=1, pictures=4, noises=2, objects=1)
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +32,13 @@ def shards(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def place(tmp_path, shards) -> Place:
+def folder(tmp_path, shards) -> TrainingFolder:
     (tmp_path / "shards").symlink_to(shards)
-    return Place(tmp_path)
+    return TrainingFolder(tmp_path)
 
 
-def curve(place: Place, stage: str) -> list[float]:
-    return [json.loads(line)["loss"] for line in place.curve(stage).read_text().splitlines()]
+def curve(folder: TrainingFolder, stage: str) -> list[float]:
+    return [json.loads(line)["loss"] for line in folder.curve(stage).read_text().splitlines()]
 
 
 def source(shards: Path) -> Source:
@@ -68,7 +70,7 @@ def test_correspondences_end_on_the_object_and_angles_are_those_of_all_templates
 
 
 def test_the_loss_is_least_where_cosines_peak_at_the_true_places(shards):
-    """Directions that turn with the place: the query's cells are given those of their counterparts in a template."""
+    """Directions that turn with the folder: the query's cells are given those of their counterparts in a template."""
     batch = pair_batch(source(shards), 0, count=1)
     maps = torch.randn(CLUSTERS_PER_OBJECT * (QUERIES + TEMPLATES), 256, CELLS, CELLS)
     random = losses.correspondence_loss(maps, batch, torch.tensor(20.0))
@@ -76,14 +78,14 @@ def test_the_loss_is_least_where_cosines_peak_at_the_true_places(shards):
     only = replace(batch, matched=batch.matched.clone(), template_xy=whole)
     only.matched[:, :, :, 1:] = False
     only.matched[:, :, 1:] = False
-    told = maps.clone()
+    matched = maps.clone()
     for c in range(CLUSTERS_PER_OBJECT):
         first = c * (QUERIES + TEMPLATES)
         for k in torch.nonzero(only.matched[0, c, 0, 0])[:, 0]:
             x, y = only.query_xy[0, c, 0, 0, k].long()
             u, v = only.template_xy[0, c, 0, 0, k].long()
-            told[first, :, y, x] = maps[first + QUERIES, :, v, u]
-    assert losses.correspondence_loss(told, only, torch.tensor(20.0)) < random / 2
+            matched[first, :, y, x] = maps[first + QUERIES, :, v, u]
+    assert losses.correspondence_loss(matched, only, torch.tensor(20.0)) < random / 2
 
 
 def test_a_query_scores_itself_highest_among_templates(shards):
@@ -102,7 +104,7 @@ def test_a_mesh_like_a_scan_differs_from_the_object_in_colour_and_relief_and_now
     (clusters,), rng = source(shards).objects(0, 1)
     seen = []
     for _ in range(8):
-        for cluster, drawn in zip(clusters, scanned(clusters, rng), strict=True):
+        for cluster, drawn in zip(clusters, imitate_scan(clusters, rng), strict=True):
             for view, mesh in zip(cluster, drawn, strict=True):
                 assert np.array_equal(view.depth, mesh.depth)
                 assert np.array_equal(view.albedo[~view.mask], mesh.albedo[~view.mask])
@@ -112,19 +114,19 @@ def test_a_mesh_like_a_scan_differs_from_the_object_in_colour_and_relief_and_now
     assert np.median(seen) > 5
 
 
-def test_batches_that_other_processes_draw_are_those_drawn_here(place):
-    stage = Autoencoder(PLAN, place, 3)
-    here, elsewhere = (list(batches(stage, 1, workers)) for workers in (0, 2))
+def test_batches_that_other_processes_draw_are_those_drawn_here(folder):
+    stage = Autoencoder(PLAN, folder, 3)
+    here, elsewhere = (list(iterate_batches(stage, 1, workers)) for workers in (0, 2))
     assert len(here) == len(elsewhere) == 2
     assert all(torch.equal(a, b) for a, b in zip(here, elsewhere, strict=True))
 
 
 @pytest.mark.slow
-def test_training_from_nothing_gives_the_same_losses_and_goes_on_as_if_never_stopped(place, tmp_path, shards):
+def test_training_from_nothing_gives_the_same_losses_and_goes_on_as_if_never_stopped(folder, tmp_path, shards):
     torch.set_num_threads(1)
-    assert train(Autoencoder(PLAN, place, 3), place, until=time.time() + 300)
-    whole = curve(place, "autoencoder")
-    other = Place(tmp_path / "other")
+    assert train(Autoencoder(PLAN, folder, 3), folder, until=time.time() + 300)
+    whole = curve(folder, "autoencoder")
+    other = TrainingFolder(tmp_path / "other")
     other.folder.mkdir()
     (other.folder / "shards").symlink_to(shards)
     stage = Autoencoder(PLAN, other, 3)
@@ -137,10 +139,10 @@ def test_training_from_nothing_gives_the_same_losses_and_goes_on_as_if_never_sto
 
 
 @pytest.mark.slow
-def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(place, tmp_path):
+def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(folder, tmp_path):
     for kind, steps in ((Autoencoder, 1), (Denoiser, 2), (Descriptors, 2)):
-        assert train(kind(PLAN, place, steps), place, until=time.time() + 300)
-    size = export(place, tmp_path / "weights")
+        assert train(kind(PLAN, folder, steps), folder, until=time.time() + 300)
+    size = export(folder, tmp_path / "weights")
     names = {path.name for path in (tmp_path / "weights").iterdir()}
     assert names == {
         "config.json",
@@ -153,4 +155,4 @@ def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(place, tmp_pa
     assert size < 25_000_000
     curves = json.loads((tmp_path / "weights" / "losses.json").read_text())
     assert [record["step"] for record in curves["denoiser"]] == [0, 1]
-    assert curves["autoencoder"][0]["loss"] == curve(place, "autoencoder")[0]
+    assert curves["autoencoder"][0]["loss"] == curve(folder, "autoencoder")[0]
