@@ -1,1 +1,1 @@
-"""Pure functions on arrays and tensors. One module owns each convention."""
+"""Pure functions on arrays and tensors. Each convention is defined in one module."""

@@ -1,1 +1,1 @@
-"""Nouns that travel between the steps: frozen dataclasses of arrays and tensors."""
+"""Data passed between stages: frozen dataclasses of arrays and tensors."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class TemplateMatch:
-    """The k best templates, best first. ``margin``: best score minus the best score outside the k kept (0 if none)."""
+    """The k best templates, best first. ``margin``: best score minus the best score outside these k (0 if none)."""
 
     index: Int[Tensor, " k"]
     score: Float[Tensor, " k"]
@@ -28,7 +28,7 @@ class TrueMatches:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """m pairs of points in crop pixels (x, y), with cosine similarity and the index of their cluster pair."""
+    """m corresponding points, crop pixels (x, y), with their cosine similarity and the index of their cluster pair."""
 
     query_px: Float[Tensor, "m 2"]
     template_px: Float[Tensor, "m 2"]

@@ -1,4 +1,4 @@
-"""The object: its mesh and its symmetries."""
+"""Objects: meshes, diameters and symmetries."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh in millimetres, with one of: a texture, vertex colours, or neither (rendered grey).
+    """A triangle mesh in millimetres with a texture, vertex colours, or neither (rendered grey).
 
-    ``uv`` has its origin at the lower left of ``texture``, as ply, obj and trimesh have it; ``texture`` rows go down.
-    ``digest`` is the sha256 of all bytes the mesh was read from (mesh, material and texture files).
+    ``uv`` has its origin at the lower left of ``texture``, as in ply, obj and trimesh; rows of ``texture`` go from top
+    to bottom. ``digest``: sha256 of all files the mesh was read from (mesh, materials and textures).
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -26,9 +26,9 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """An object a pose is asked of.
+    """An object whose pose can be estimated.
 
-    ``symmetries`` are rigid transforms T_obj_obj (s 4 4, mm), the identity first, continuous ones discretised.
+    ``symmetries``: rigid transforms T_obj_obj (s 4 4, mm), the identity first, continuous symmetries discretised.
     """
 
     obj_id: int

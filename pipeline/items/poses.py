@@ -1,4 +1,4 @@
-"""Poses: what a solver returns, and what the route answers for a detection."""
+"""Poses: the result of a solver, and the result of the route for a detection."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """A solver's answer, or a refined one: ``inliers`` are those of the solver's pose either way.
+    """A solved or refined pose, mm. After refinement, ``inliers`` are still those of the solver's pose.
 
-    ``reprojection_px``: root mean square over these inliers under T_cam_obj, in the query image.
+    ``reprojection_px``: root mean square reprojection error of the inliers under T_cam_obj, in query image pixels.
     """
 
     T_cam_obj: Float[np.ndarray, "4 4"]
@@ -23,10 +23,10 @@ class PoseSolution:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """The pose of one detection, mm. ``score`` orders estimates of one object in one image; higher is better.
+    """The pose of one detection, mm. ``score`` ranks the estimates of one object in one image; higher is better.
 
-    ``template_margin``: how far the chosen templates stand out from the rest. ``fallback``: "" for a solved pose,
-    otherwise what stood in for it. ``notes``: what stages clamped or skipped. ``times_s``: seconds by stage.
+    It is not a calibrated confidence. ``template_margin``: as TemplateMatch.margin. ``fallback``: "" for a solved pose,
+    otherwise what replaced it. ``notes``: what stages clamped or skipped. ``times_s``: seconds by stage.
     ``detection_id`` counts the detections of this object in this image; ``reprojection_px`` is None for a fallback.
     """
 
@@ -51,9 +51,9 @@ class PoseEstimate:
 
 @dataclass(frozen=True)
 class NoEstimate:
-    """Why a target has no pose: the stage that gave up and its reason.
+    """Why a target has no pose: the stage that failed and its reason.
 
-    ``detection_id`` None: nothing was detected; ``template_id`` None: no template was matched.
+    ``detection_id`` is None if nothing was detected, ``template_id`` if no template was matched.
     """
 
     scene_id: int

@@ -1,4 +1,4 @@
-"""What a camera sees: templates, detections, targets and the square crops made of them."""
+"""Views of objects: templates, images, targets, detections, proposals and square crops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """Rendered views of one object. Pixel centres are integers; depth is along the optical axis, 0 = background."""
+    """n rendered views of one object. Depth is along the optical axis, 0 for background; K in px, T_cam_obj in mm."""
 
     rgb: UInt8[np.ndarray, "n H W 3"]
     depth_mm: Float32[np.ndarray, "n H W"]
@@ -23,7 +23,7 @@ class Templates:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What the oracle knows of each view of a batch: depth map, camera and pose (for ``extract=coordinates``)."""
+    """True depth map, camera and pose of each view in a batch, for the oracle extractor ``extract=coordinates``."""
 
     depth_mm: Sequence[Float32[np.ndarray, "H W"]]
     K: Float[np.ndarray, "n 3 3"]
@@ -32,7 +32,7 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """One square crop of a view: black outside ``mask``; the homography A_crop_img takes image to crop pixels."""
+    """A square crop of a view, black outside ``mask``. The homography A_crop_img maps image to crop pixels."""
 
     rgb: UInt8[np.ndarray, "S S 3"]
     mask: Bool[np.ndarray, "S S"]
@@ -41,7 +41,7 @@ class Crop:
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """Square crops of n views: background removed (black) outside ``mask``; A_crop_img takes image to crop pixels."""
+    """Square crops of n views, black outside ``mask``. Each homography A_crop_img maps image to crop pixels."""
 
     rgb: UInt8[np.ndarray, "n S S 3"]
     mask: Bool[np.ndarray, "n S S"]
@@ -52,9 +52,8 @@ class Crops:
         return len(self.rgb)
 
     def __getitem__(self, rows: slice | Sequence[int]) -> Crops:
-        """The crops of some rows, geometry included."""
-        index = range(len(self))[rows] if isinstance(rows, slice) else list(rows)
-        take = list(index)
+        """The selected crops, with their geometry."""
+        take = list(range(len(self))[rows] if isinstance(rows, slice) else rows)
         geometry = self.geometry and Geometry(
             [self.geometry.depth_mm[i] for i in take], self.geometry.K[take], self.geometry.T_cam_obj[take]
         )
@@ -63,7 +62,7 @@ class Crops:
 
 @dataclass(frozen=True)
 class Target:
-    """What BOP asks: ``inst_count`` poses of object ``obj_id`` in image ``im_id`` of scene ``scene_id``."""
+    """A BOP target: estimate ``inst_count`` poses of object ``obj_id`` in image ``im_id`` of scene ``scene_id``."""
 
     scene_id: int
     im_id: int
@@ -73,12 +72,12 @@ class Target:
 
 @dataclass(frozen=True)
 class Detection:
-    """One object found in one image.
+    """An object detected in an image.
 
-    ``bbox_xyxy``: edges in pixels, pixel i covers [i - 0.5, i + 0.5], so a mask from column 3 to 5 spans 2.5 to 5.5.
-    ``rle``: COCO compressed RLE of the full-image mask ({"size": [h, w], "counts": str}), or None for a box alone.
-    ``gt_id``: index in scene_gt of the instance it was made from, when it was made from ground truth.
-    ``defect``: why it cannot be used, found when it was read; such a detection becomes a NoEstimate.
+    ``bbox_xyxy``: edges in pixels; pixel i covers [i - 0.5, i + 0.5], so a mask of columns 3 to 5 spans 2.5 to 5.5.
+    ``rle``: COCO compressed RLE of the mask in the full image ({"size": [h, w], "counts": str}), None for a box only.
+    ``gt_id``: index in scene_gt.json of the instance, for detections made from ground truth. ``defect``: why it cannot
+    be used, determined when it is read; such a detection becomes a NoEstimate.
     """
 
     scene_id: int
@@ -94,9 +93,9 @@ class Detection:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A part of an image that may be an object, of whatever class; box and mask as in Detection.
+    """A class-agnostic segment of an image that may be an object; box and mask as in Detection.
 
-    ``confidence``: the IoU its model predicts of the mask, about 0..1 (SAM's may leave that range a little).
+    ``confidence``: the mask's IoU as predicted by the model, about 0..1 (SAM's values may slightly exceed this range).
     """
 
     bbox_xyxy: tuple[float, float, float, float]
@@ -106,7 +105,7 @@ class Proposal:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A photograph with its camera. ``rgb`` is 8 bit; a grey image has three equal channels."""
+    """An 8-bit rgb image with its camera matrix (px); a grey image has three equal channels."""
 
     scene_id: int
     im_id: int
