@@ -57,7 +57,7 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
             return
         _run_step(graph, options)
     seconds = time.perf_counter() - start
-    print(f"\n{context.progress.table()}\n{'whole run':<20}{'':>20}{seconds:>10.1f}", flush=True)
+    print(f"\n{context.progress.table()}\n{'total':<20}{'':>20}{seconds:>10.1f}", flush=True)
 
 
 def make_report(out: str) -> None:
@@ -136,7 +136,7 @@ def _estimate(graph: Graph, options: Options) -> None:
     scores = _score_nodes(graph, options)
     folder = OutputFolder(graph, scores, options)
     if options.resume and scores is not None and folder.is_finished():
-        print(f"finished before: {folder.record}")
+        print(f"already finished: {folder.record}")
         return
     warnings = graph.warnings()
     for warning in warnings[:MAX_ROWS]:
@@ -151,7 +151,7 @@ def _estimate(graph: Graph, options: Options) -> None:
     print(places_text(folder, overlays=options.overlays))
     if evaluation is not None:
         cases = pictures.draw_gallery(options.gallery)
-        print(f"row       {write_record(folder, answers, evaluation, cases)}")
+        print(f"record    {write_record(folder, answers, evaluation, cases)}")
 
 
 def _make_folder(out: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a plan foretells is what a run then takes; what a run may not exceed, it does not."""
+"""Plans estimate what a run takes, and runs stay within their budgets."""
 
 import gc
 import json
@@ -17,7 +17,6 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from pipeline.backbones.batching import Footprint, compute_batch_size
 from pipeline.errors import BadInput
 from pipeline.graph import Graph, Memory
-from pipeline.graph.lru import LRUCache
 from pipeline.graph.plan import Node
 from pipeline.spec import Runtime
 from pipeline.store import LocalStoreConfig, Store
@@ -54,12 +53,12 @@ def planned(dzop, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[lis
     return nodes, ran.out
 
 
-def test_a_run_writes_the_bytes_and_makes_the_passes_that_its_plan_foretold(dzop, monkeypatch):
-    nodes, told = planned(dzop, monkeypatch)
+def test_a_run_writes_the_bytes_and_makes_the_passes_of_its_plan(dzop, monkeypatch):
+    nodes, printed = planned(dzop, monkeypatch)
     assert {node.state for node in nodes} == {"missing"}
     made = dzop().counts()[0]
     assert sum(node.passes for node in nodes) == made["template features"][0] + made["query features"][0] == 14
-    assert "passes  14 images through the backbone" in told
+    assert "passes  14 images through the backbone" in printed
     store = Store(LocalStoreConfig(root="cache"))
     fits = [node for node in nodes if node.step == "fits"]
     assert len(fits) == 4
@@ -76,24 +75,24 @@ def test_a_run_writes_the_bytes_and_makes_the_passes_that_its_plan_foretold(dzop
         assert store.stored_bytes(node.ref.path) == pytest.approx(node.nbytes, rel=0.01)
 
 
-def test_time_is_foretold_by_what_was_measured_here_and_by_nothing_else(dzop, monkeypatch):
+def test_time_is_estimated_only_from_timings_of_the_same_work(dzop, monkeypatch):
     assert "time    unknown for templates, template crops" in planned(dzop, monkeypatch)[1]
     dzop("select.objects=[1]")
-    nodes, told = planned(dzop, monkeypatch, "select.objects=[2]")
+    nodes, printed = planned(dzop, monkeypatch, "select.objects=[2]")
     seconds = [node.seconds for node in nodes if node.step in ("templates", "template features", "fits", "poses")]
     assert all(s is not None for s in seconds)
     assert sum(seconds) > 0
-    assert re.search(r"time +\d+\.\d s \(templates \d+\.\d s, template crops .*poses \d+\.\d s\)", told)
+    assert re.search(r"time +\d+\.\d s \(templates \d+\.\d s, template crops .*poses \d+\.\d s\)", printed)
     assert "unknown for poses:" in planned(dzop, monkeypatch, "cluster.count=3")[1]
     assert "unknown for templates, " in planned(dzop, monkeypatch, "render.size=80")[1]
-    (rates,) = Path("cache/.rates").glob("*.json")
-    rates.write_text(json.dumps([1, 2]))
+    (timings,) = Path("cache/.rates").glob("*.json")
+    timings.write_text(json.dumps([1, 2]))
     assert "unknown for templates, " in planned(dzop, monkeypatch, "select.objects=[2]")[1]
 
 
 @pytest.mark.parametrize("size", ["8 gigs", "0GiB", "-1GB", "8", "GiB", "8iB", "[8]", "nan"])
 @pytest.mark.parametrize("field", ["max_memory", "max_vram"])
-def test_what_is_no_size_is_refused_in_one_line(dzop, field, size):
+def test_an_invalid_size_is_refused_in_one_line(dzop, field, size):
     ran = dzop(f"runtime.{field}={size}", "step=detect")
     assert ran.status == 1
     assert ran.err.strip().startswith(f"error: runtime.{field}: found ")
@@ -101,13 +100,13 @@ def test_what_is_no_size_is_refused_in_one_line(dzop, field, size):
     assert len(ran.err.strip().splitlines()) == 1
 
 
-def test_sizes_are_read_as_people_write_them():
+def test_sizes_are_read_with_their_units():
     asked = {"8GiB": 8 << 30, "500MB": 500_000_000, "1.5 gib": 3 << 29, "12B": 12, None: None}
     for text, size in asked.items():
         assert Runtime(max_memory=text).memory_bytes == Runtime(max_vram=text).vram_bytes == size
 
 
-def test_a_run_that_cannot_fit_says_so_before_anything_is_spent(dzop):
+def test_a_run_that_exceeds_its_budget_is_refused_before_it_computes_anything(dzop):
     ran = dzop("runtime.max_memory=50MB")
     assert ran.status == 1
     (line,) = ran.err.strip().splitlines()
@@ -121,7 +120,7 @@ def test_a_run_that_cannot_fit_says_so_before_anything_is_spent(dzop):
     bank.check(200, "runtime.max_memory", "200B")
 
 
-def test_a_batch_is_sized_to_the_budget():
+def test_the_batch_size_follows_the_budget():
     cpu, footprint = (
         torch.device("cpu"),
         Footprint(weight_bytes=0, bytes_per_pass=5 << 20, bytes_per_crop=10 << 20, max_batch=16),
@@ -158,12 +157,12 @@ def test_a_run_stays_below_its_budget(tmp_path, scene):
     command = [sys.executable, "-c", PEAK, "150000000", *arguments, *more]
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     assert ran.returncode == 0, ran.stderr
-    told = re.search(r"budget (\d+) peak (\d+)", ran.stdout)
-    assert told, ran.stdout
-    assert int(told[2]) <= int(told[1])
+    sizes = re.search(r"budget (\d+) peak (\d+)", ran.stdout)
+    assert sizes, ran.stdout
+    assert int(sizes[2]) <= int(sizes[1])
 
 
-def test_templates_of_one_object_are_in_memory_at_a_time(dzop, monkeypatch):
+def test_only_one_objects_templates_are_in_memory(dzop, monkeypatch):
     graphs: list[Graph] = []
 
     class Seen(Graph):
@@ -182,16 +181,8 @@ def test_templates_of_one_object_are_in_memory_at_a_time(dzop, monkeypatch):
     assert first() is None
 
 
-def test_the_last_values_are_kept_as_far_as_they_fit():
-    made: list[int] = []
-    kept = LRUCache(lambda key: made.append(key) or key, lambda value: value, limit=10)
-    for key in (3, 4, 3, 5, 3, 4, 99, 99):
-        assert kept(key) == key
-    assert made == [3, 4, 5, 4, 99]
-
-
 @pytest.mark.parametrize("method", ["dzop_sd", "dzop_x"])
-def test_a_plan_fetches_no_weights_and_says_what_it_does_not_know(dzop, monkeypatch, method):
+def test_a_plan_downloads_no_weights_and_names_the_missing_ones(dzop, monkeypatch, method):
     asked: list[bool] = []
 
     def snapshot(*args, local_files_only: bool = False, **kwargs):

@@ -1,4 +1,4 @@
-"""The command line from end to end, on a small synthetic dataset that is written once."""
+"""The command line end to end, on a small synthetic dataset."""
 
 import json
 import shutil
@@ -50,7 +50,7 @@ def results(folder: Path) -> Path:
     return next(folder.glob("results/*/*/poses.json")).parent
 
 
-def test_one_command_takes_a_dataset_to_poses_and_a_second_one_computes_nothing(dzop, tmp_path):
+def test_one_command_estimates_poses_and_a_second_one_computes_nothing(dzop, tmp_path):
     first = dzop("overlays=true")
     assert first.status == 0
     made = first.counts()[0]
@@ -69,13 +69,13 @@ def test_one_command_takes_a_dataset_to_poses_and_a_second_one_computes_nothing(
     assert {step: sum(counts) for step, counts in again.items()} == {step: sum(counts) for step, counts in made.items()}
 
 
-def test_a_run_that_finds_everything_looks_into_no_mesh(dzop, cache, monkeypatch):
+def test_a_cached_run_parses_no_mesh(dzop, cache, monkeypatch):
     dzop(f"store.root={cache}", "gallery=0")
     monkeypatch.setattr("pipeline.bop.dataset.read_model", None)
     assert dzop(f"store.root={cache}", "gallery=0").status == 0
 
 
-def test_a_mesh_that_does_not_fit_its_annotations_stops_a_run_that_finds_its_templates(
+def test_a_mesh_of_the_wrong_diameter_is_refused_even_with_cached_templates(
     tmp_path, scene, cache, dzop, capsys, monkeypatch
 ):
     dzop(f"store.root={cache}", "step=onboard")
@@ -89,7 +89,7 @@ def test_a_mesh_that_does_not_fit_its_annotations_stops_a_run_that_finds_its_tem
     assert "poses" not in ran.out.split("targets")[-1]
 
 
-def test_the_same_run_gives_the_same_csv_but_for_its_times(dzop, tmp_path):
+def test_two_runs_write_the_same_csv_except_for_times(dzop, tmp_path):
     dzop("store.root=a", "out=a/results")
     dzop("store.root=b", "out=b/results")
     ours, theirs = (read_results(next((tmp_path / name).glob("results/*/*/*.csv"))) for name in "ab")
@@ -98,7 +98,7 @@ def test_the_same_run_gives_the_same_csv_but_for_its_times(dzop, tmp_path):
         assert (a.scene_id, a.im_id, a.obj_id, a.score) == (b.scene_id, b.im_id, b.obj_id, b.score)
 
 
-def test_a_sweep_over_matching_parameters_touches_no_template_and_no_backbone(dzop):
+def test_a_sweep_over_matching_parameters_reuses_templates_and_features(dzop):
     ran = dzop("-m", "cluster.count=5,10", "fuse.dim=16,32")
     assert ran.status == 0
     first, *others = ran.counts()
@@ -134,7 +134,7 @@ def test_a_plan_computes_nothing_and_shows_every_node(dzop, tmp_path):
     assert "nodes cached" in warm
 
 
-def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, scene, cache, capsys, monkeypatch):
+def test_a_run_record_has_the_scores_of_its_csv(dzop, tmp_path, scene, cache, capsys, monkeypatch):
     ran = dzop(f"store.root={cache}", "gallery=2")
     assert ran.status == 0
     (row,) = read_run_records(tmp_path / "results")
@@ -144,12 +144,12 @@ def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, sc
     assert len(row.cases) == 2
     assert all((tmp_path / "results" / row.folder / case.file).exists() for case in row.cases)
     assert len(row.templates) == 4
-    told = json.loads((results(tmp_path) / "poses.json").read_text())["scores"]["metrics"]
+    written = json.loads((results(tmp_path) / "poses.json").read_text())["scores"]["metrics"]
     csv = str(next(tmp_path.glob("results/*/*/*.csv")))
     scored = run_dzop(capsys, monkeypatch, "score", csv, "--dataset", str(scene), "--json", "scored.json")
     assert scored.status == 0, scored.err
     same = json.loads(Path("scored.json").read_text())["metrics"]
-    assert {name: same[name] for name in told} == pytest.approx(told)
+    assert {name: same[name] for name in written} == pytest.approx(written)
     assert row.metrics["AR"] == pytest.approx(same["AR"])
     dzop(f"store.root={cache}", "gallery=3")
     (again,) = read_run_records(tmp_path / "results")
@@ -158,14 +158,14 @@ def test_a_run_leaves_a_row_whose_scores_are_those_of_its_csv(dzop, tmp_path, sc
     assert same["AR_VSD"] is not None
 
 
-def test_poses_alone_are_held_against_nothing(dzop, tmp_path, cache):
+def test_step_estimate_scores_nothing(dzop, tmp_path, cache):
     ran = dzop(f"store.root={cache}", "step=estimate")
     assert ran.status == 0
     assert "AR_MSSD" not in ran.out
     assert not (tmp_path / "results" / "rows").exists()
 
 
-def test_what_is_not_annotated_cannot_be_evaluated(dzop, tmp_path, scene, cache):
+def test_step_evaluate_needs_ground_truth(dzop, tmp_path, scene, cache):
     shutil.copytree(scene, tmp_path / "bare")
     for path in (tmp_path / "bare" / "test" / "000001").glob("scene_gt*.json"):
         path.unlink()
@@ -188,19 +188,19 @@ def test_an_oracle_needs_detections_of_ground_truth(dzop, cache):
     assert "match=oracle: found detections without ground truth, needs detect=gt_mask or detect=gt_bbox" in ran.err
 
 
-def test_steps_stop_where_they_are_told(dzop, tmp_path):
+def test_each_step_computes_only_what_it_needs(dzop, tmp_path):
     assert set(dzop("step=onboard").counts()[0]) == {"templates", "template crops", "template features"}
     assert set(dzop("step=detect").counts()[0]) == {"detections"}
     assert not (tmp_path / "results").exists()
 
 
-def test_a_part_of_the_targets_can_be_selected(dzop, tmp_path, cache):
+def test_targets_can_be_selected(dzop, tmp_path, cache):
     dzop(f"store.root={cache}", "select.objects=[2]", "select.images=[0]")
     answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
     assert [(answer["im_id"], answer["obj_id"]) for answer in answers] == [(0, 2)]
 
 
-def test_one_bad_detection_is_recorded_and_the_run_goes_on(dzop, tmp_path, scene, cache):
+def test_a_bad_detection_is_recorded_and_the_run_continues(dzop, tmp_path, scene, cache):
     good = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [100, 80, 60, 60], "time": 0.1}
     bad = {**good, "category_id": 2, "segmentation": {"size": [3, 3], "counts": [9]}}
     Path("found.json").write_text(json.dumps([good, bad]))
@@ -240,7 +240,7 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("cluster.size=3",), "Could not override 'cluster.size'"),
         (("+cluster.size=3",), "cluster.size: found an unknown field, needs one of: count"),
@@ -265,18 +265,18 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
         (("detect=photo",), "dataset=photo"),
     ],
 )
-def test_a_mistake_is_told_in_one_line(dzop, tmp_path, arguments, told):
+def test_a_mistake_is_reported_in_one_line(dzop, tmp_path, arguments, message):
     ran = dzop(*arguments)
     assert ran.status == 1
     lines = [line for line in ran.err.splitlines() if line]
     assert len(lines) == 1
     assert lines[0].startswith("error: ")
-    assert told in lines[0]
+    assert message in lines[0]
     assert not list(tmp_path.glob("cache/*/*/zarr.json"))
 
 
 @pytest.mark.parametrize("drawn_in", ["colour", "alpha", "palette"])
-def test_a_mask_with_an_alpha_channel_or_a_palette_is_the_same_mask(tmp_path, scene, monkeypatch, drawn_in):
+def test_a_mask_with_alpha_or_palette_reads_as_the_same_mask(tmp_path, scene, monkeypatch, drawn_in):
     monkeypatch.chdir(tmp_path)
     plain = Image.open(scene / "test" / "000001" / "mask_visib" / "000000_000000.png").convert("L")
     white, opaque = Image.new("L", plain.size, 255), Image.new("L", plain.size, 255)
@@ -288,7 +288,7 @@ def test_a_mask_with_an_alpha_channel_or_a_palette_is_the_same_mask(tmp_path, sc
     np.testing.assert_array_equal(read_mask(Path("mask.png")), np.asarray(plain) > 0)
 
 
-def test_the_reason_of_a_refused_detection_is_that_of_this_file(dzop, tmp_path, cache):
+def test_a_refused_detection_names_the_values_of_its_own_file(dzop, tmp_path, cache):
     entry = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "time": 0.1}
     for name, bbox in (("short", [1, 2, 3]), ("flat", [1, 2, 0, 3])):
         Path("found.json").write_text(json.dumps([{**entry, "bbox": bbox}]))
@@ -297,7 +297,7 @@ def test_the_reason_of_a_refused_detection_is_that_of_this_file(dzop, tmp_path, 
         assert str(bbox) in answers[0]["reason"]
 
 
-def test_a_sweep_goes_on_after_a_job_that_fails_and_names_it_at_the_end(dzop, cache):
+def test_a_sweep_continues_after_a_failed_job_and_names_it_at_the_end(dzop, cache):
     ran = dzop("-m", f"store.root={cache}", "cluster.count=4,0,6")
     assert ran.status == 1
     assert len(ran.counts()) == 2
@@ -306,7 +306,7 @@ def test_a_sweep_goes_on_after_a_job_that_fails_and_names_it_at_the_end(dzop, ca
     assert "cluster.count=0" in last
 
 
-def test_a_photograph_of_another_size_than_its_mask_is_told(dzop, tmp_path, scene, capsys, monkeypatch):
+def test_a_mask_of_the_wrong_size_is_reported(dzop, tmp_path, scene, capsys, monkeypatch):
     Image.new("L", (10, 10), 255).save("mask.png")
     ran = run_dzop(
         capsys, monkeypatch, "dataset=photo", f"dataset.mesh={scene}/models/obj_000001.ply", *SMALL[:3],
@@ -316,21 +316,22 @@ def test_a_photograph_of_another_size_than_its_mask_is_told(dzop, tmp_path, scen
 
 
 MATCHER = '''
-"""query features, template bank -> the first template, whatever the query."""
+"""query, template bank -> the first template, whatever the query."""
 from typing import ClassVar
 
 import torch
 
 from pipeline.items.matches import TemplateMatch
-from pipeline.spec import Spec, spec
+from pipeline.spec import spec
+from pipeline.stages.match import Matcher
 
 
 @spec
-class First(Spec):
+class First(Matcher):
     kind: ClassVar[str] = "match.first"
     layer: int = 2
 
-    def __call__(self, query, query_mask, bank, bank_mask):
+    def __call__(self, query, bank):
         return TemplateMatch(index=torch.tensor([0]), score=torch.tensor([1.0]), margin=0.0)
 '''
 
@@ -352,7 +353,7 @@ def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         (("dataset.K=[1,2]",), "dataset.K: found 2 numbers, needs [fx,fy,cx,cy]"),
         (("dataset.K=[nan,300,160,120]",), "nan"),
@@ -364,7 +365,7 @@ def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
         (("dataset.mask=both.png",), "dataset: found both of mask and bbox"),
     ],
 )
-def test_a_mistake_in_ones_own_data_is_told_in_one_line(tmp_path, scene, capsys, monkeypatch, given, told):
+def test_a_mistake_in_ones_own_data_is_reported_in_one_line(tmp_path, scene, capsys, monkeypatch, given, message):
     monkeypatch.chdir(tmp_path)
     frame = scene / "test" / "000001" / "rgb" / "000000.png"
     good = (f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={frame}", "dataset.bbox=[100,80,60,60]")
@@ -372,7 +373,7 @@ def test_a_mistake_in_ones_own_data_is_told_in_one_line(tmp_path, scene, capsys,
     ran = run_dzop(capsys, monkeypatch, "dataset=photo", *SMALL, *good, *camera, *given)
     assert ran.status == 1
     assert len(ran.err.splitlines()) == 1
-    assert told in ran.err
+    assert message in ran.err
 
 
 def test_cache_commands_list_measure_verify_and_clean(dzop):

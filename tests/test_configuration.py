@@ -1,4 +1,4 @@
-"""Every yaml of conf/ is its class: same fields, same defaults, one name for file, yaml and kind."""
+"""Every yaml of conf/ matches its class: same fields, same defaults, one name for file, yaml and kind."""
 
 import importlib
 from dataclasses import MISSING, fields
@@ -15,7 +15,7 @@ VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.ya
 
 
 def loaded(path: Path) -> tuple[type, dict]:
-    """The class of a yaml and its fields; the variants in its defaults list are built into the fields they are for."""
+    """The class of a yaml and its fields, with the variants of its defaults list built."""
     around = {"weights": OmegaConf.load(CONF / "config.yaml").weights, "variant": OmegaConf.load(path)}
     values = OmegaConf.to_container(OmegaConf.create(around), resolve=True)["variant"]
     for entry in values.pop("defaults", ()):

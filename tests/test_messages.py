@@ -1,4 +1,4 @@
-"""What a user is told: of layers, of weights, of jobs that fail, of masks that are odd, and after Ctrl-C."""
+"""Messages about layers, weights, failed jobs, suspicious masks, and after Ctrl-C."""
 
 import json
 import signal
@@ -39,7 +39,7 @@ def dzop(capsys, monkeypatch, tmp_path, scene):
     return run
 
 
-def test_only_layers_that_a_field_takes_are_offered(dzop, tmp_path):
+def test_an_unknown_layer_is_reported_with_the_layers_its_field_takes(dzop, tmp_path):
     weights = write_vit(tmp_path / "vit")
     for field, value in (("match.layer", "40"), ("fuse.layers", "[40]")):
         ran = dzop("extract=dino", f"weights.dino={weights}", "fuse.layers=[1]", "match.layer=1", f"{field}={value}")
@@ -56,26 +56,26 @@ def test_only_layers_that_a_field_takes_are_offered(dzop, tmp_path):
         ("detect=cnos", "detect.proposals.weights", "sam"),
     ],
 )
-def test_weights_that_are_missing_are_told_with_the_field_that_sets_them_for_a_sweep(dzop, choice, field, name):
-    own = ("extract@detect.describe=hog", "detect.describe_layer=8") if name == "sam" else ()
-    ran = dzop(choice, *own, f"weights.{name}=./nowhere")
+def test_missing_weights_are_reported_with_the_field_that_sets_them(dzop, choice, field, name):
+    detector = ("extract@detect.describe=hog", "detect.describe_layer=8") if name == "sam" else ()
+    ran = dzop(choice, *detector, f"weights.{name}=./nowhere")
     (line,) = ran.err.strip().splitlines()
     assert line.startswith(f"error: {field}: found './nowhere'")
     assert f"weights.{name}=FOLDER sets it for all methods" in line
 
 
-def test_a_failure_is_forgotten_once_its_job_has_ended_well_with_other_weights(dzop, tmp_path):
-    whole = write_vit(tmp_path / "vit")
+def test_a_failure_is_resolved_by_a_rerun_with_other_weights(dzop, tmp_path):
+    weights = write_vit(tmp_path / "vit")
     jobs = ("extract=dino", "fuse.layers=[1]", "match.layer=1", "cluster.count=3,4")
     assert dzop(*jobs, "weights.dino=./nowhere", flags=("-m",)).status == 1
     rows = read_run_records(tmp_path / "results")
     assert [row.config["cluster"]["count"] for row in unresolved_failures(rows)] == [3, 4]
-    assert dzop(*jobs[:3], "cluster.count=4", f"weights.dino={whole}").status == 0
+    assert dzop(*jobs[:3], "cluster.count=4", f"weights.dino={weights}").status == 0
     rows = read_run_records(tmp_path / "results")
     assert [row.config["cluster"]["count"] for row in unresolved_failures(rows)] == [3]
 
 
-def test_a_sweep_ends_with_a_line_that_can_be_read():
+def test_the_last_line_of_a_sweep_is_short():
     command = ["dzop", "-m", "dataset=lmo", "a=1,2,3,4,5"]
     failed = [(["dataset=lmo", f"a={n}"], "weights: found nothing") for n in range(5)]
     assert failures_text(failed[:2], command) == "a=0, a=1 (weights: found nothing)"
@@ -93,7 +93,7 @@ def inside(row: int, column: int, h: int, w: int) -> np.ndarray:
 
 @pytest.fixture
 def photo(capsys, monkeypatch, tmp_path, scene):
-    """A run on one photograph of the scene; beside the mesh and the photograph, the arguments say all."""
+    """A run on one photograph of the scene; the mesh, the photograph and K are given."""
     monkeypatch.chdir(tmp_path)
     mesh, image = f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={scene}/test/000001/rgb/000000.png"
 
@@ -104,7 +104,7 @@ def photo(capsys, monkeypatch, tmp_path, scene):
 
 
 @pytest.mark.parametrize(
-    ("mask", "told"),
+    ("mask", "message"),
     [
         (inside(60, 80, 1, 1), "the mask has 1 pixel;"),
         (inside(0, 0, 120, 160), "the mask covers 100% of the image;"),
@@ -112,18 +112,18 @@ def photo(capsys, monkeypatch, tmp_path, scene):
     ],
     ids=["a pixel", "everything", "inverted"],
 )
-def test_an_odd_mask_is_told_and_kept_in_the_record(photo, tmp_path, mask, told):
+def test_a_suspicious_mask_is_warned_about_and_recorded(photo, tmp_path, mask, message):
     Image.fromarray(mask).save("mask.png")
     ran = photo("dataset.mask=mask.png")
     assert ran.status == 0, ran.err
-    assert f"warning: scene 0, image 0, object 1: {told}" in ran.out
+    assert f"warning: scene 0, image 0, object 1: {message}" in ran.out
     record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
     (warning,) = record["warnings"]
-    assert told in warning
+    assert message in warning
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         (("dataset.bbox=[40,30,130,100]",), "of the box lies outside the image; is it x, y, width, height"),
         (("dataset.bbox=[40,30,60,60]", "dataset.K=[300,300,170,90]"), "principal point (170, 90) lies outside"),
@@ -132,15 +132,15 @@ def test_an_odd_mask_is_told_and_kept_in_the_record(photo, tmp_path, mask, told)
     ],
     ids=["corners", "larger image", "swapped", "as it should be"],
 )
-def test_an_odd_box_or_camera_is_told(photo, given, told):
+def test_a_suspicious_box_or_camera_is_warned_about(photo, given, message):
     ran = photo(*given)
     assert ran.status == 0, ran.err
-    assert told in ran.out
-    assert ("warning:" in ran.out) == bool(told)
+    assert message in ran.out
+    assert ("warning:" in ran.out) == bool(message)
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ("dataset.bbox=[1,2,3]", "error: dataset.bbox: found [1, 2, 3], needs more values"),
         ("dataset.msk=a", "error: Could not override 'dataset.msk': found no such field, needs one that the yamls"),
@@ -150,14 +150,14 @@ def test_an_odd_box_or_camera_is_told(photo, given, told):
         ),
     ],
 )
-def test_a_field_that_cannot_be_read_is_told_with_what_would_be_right(photo, given, told):
+def test_an_unreadable_field_is_reported_with_what_it_needs(photo, given, message):
     ran = photo(given)
     assert ran.status == 1
-    assert told in ran.err
+    assert message in ran.err
     assert len(ran.err.strip().splitlines()) == 1
 
 
-def test_an_ordinary_mask_is_no_odd_one(dzop, tmp_path):
+def test_an_ordinary_mask_causes_no_warning(dzop, tmp_path):
     assert "warning:" not in dzop().out
     assert json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())["warnings"] == []
 
@@ -173,12 +173,12 @@ command.main()
 """
 
 
-def test_ctrl_c_leaves_one_line():
+def test_ctrl_c_prints_one_line():
     ran = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=120, check=False)
     assert ran.stderr == "interrupted. Completed entries are cached; rerun to resume.\n"
 
 
-def test_ctrl_c_while_packages_load_ends_quietly(tmp_path):
+def test_ctrl_c_during_imports_prints_no_traceback(tmp_path):
     command = [sys.executable, "-m", "pipeline", "step=detect"]
     process = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=heeds_ctrl_c

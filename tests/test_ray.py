@@ -107,7 +107,7 @@ def _table(printed: str) -> list[str]:
     """Lines of the step table, without its header and total."""
     lines = printed.splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("step "))
-    return [line for line in lines[first + 1 :] if line and not line.startswith("whole run")]
+    return [line for line in lines[first + 1 :] if line and not line.startswith("total ")]
 
 
 def test_without_ray_the_message_says_how_to_install_it(scene, tmp_path, capsys, monkeypatch):

@@ -53,7 +53,7 @@ def score_command(arguments: Sequence[str]) -> None:
         write_json(Path(options.json), record)
         print(f"json      {options.json}")
     if options.out:
-        print(f"row       {write_run_record(Path(options.out), _run_record(submission, result))}")
+        print(f"record    {write_run_record(Path(options.out), _run_record(submission, result))}")
 
 
 def lint_command(arguments: Sequence[str]) -> None:

@@ -50,7 +50,7 @@ def write_files(
 
 def places_text(folder: OutputFolder, *, overlays: bool) -> str:
     """Lines for the terminal that name every file and folder that was written."""
-    lines = [f"csv       {folder.path / folder.csv_name}", f"records   {folder.path / 'poses.json'}"]
+    lines = [f"csv       {folder.path / folder.csv_name}", f"poses     {folder.path / 'poses.json'}"]
     if folder.graph.detections.proposals:
         lines.append(f"detected  {folder.detections}")
     if overlays:

@@ -1,4 +1,4 @@
-"""What every node needs: meshes that are those of their keys, and no more of them than have to be."""
+"""Meshes that nodes share: the ones their keys were made from, and no more in memory than necessary."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,24 +16,24 @@ from pipeline.synthetic.scenes import write_dataset
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Context:
+def context(tmp_path: Path) -> Context:
     write_dataset(tmp_path, objects=2, images=1, seed=3, size_hw=(120, 160), per_image=2, progress=False)
     data, stages = open_dataset(tmp_path, name="toy"), replace(PAPER, render=Raycast(count=4, size=64))
     return Context(stages, data, data.targets, Store(MemoryStoreConfig()), Runtime(device="cpu", progress=False))
 
 
-def test_a_mesh_that_is_written_while_a_run_goes_on_is_never_taken_for_the_one_of_its_key(run: Context):
-    path = run.dataset.model_path(1)
-    first, content = run.mesh_digest(1), path.read_bytes()
+def test_a_mesh_that_changes_during_a_run_is_refused(context: Context):
+    path = context.dataset.model_path(1)
+    first, content = context.mesh_digest(1), path.read_bytes()
     path.write_bytes(content.replace(b"end_header", b"comment another\nend_header"))
     with pytest.raises(BadInput, match="a file that changed while the run was reading it"):
-        run.model(1)
+        context.model(1)
     path.write_bytes(content)
-    assert run.model(1).mesh.digest == first
+    assert context.model(1).mesh.digest == first
 
 
-def test_an_objects_mesh_is_let_go_when_its_templates_are_made(run: Context):
-    graph = Graph(run)
+def test_a_mesh_leaves_memory_once_its_templates_are_made(context: Context):
+    graph = Graph(context)
     graph.onboard()
     assert graph.templates.read_views(1).rgb.any()
-    assert not run.models.values
+    assert not context.models.values
