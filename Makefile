@@ -66,7 +66,7 @@ train-embedded: $(STAMP) ## train the model that ships, on from its checkpoints;
 benchmark-embedded: $(STAMP) ## the model that ships beside HOG, pixels and random weights, a run on each core; ARGS="--lmo ... --detections ..."
 	$(PY) -m benchmarks.accuracy $(ARGS)
 
-comparison: $(STAMP) ## dzop, zs6d, foundpose and fused features on the same detections, one page; wants weights: README
+comparison: $(STAMP) ## dzop, zs6d, foundpose and fused features on the same detections, one page; needs weights, see docs/methods.md
 	@( $(call sweep,backbones) ); status=$$?; $(PY) -m pipeline dataset=demo step=report $(ARGS); exit $$status
 
 report: $(STAMP) ## one page of all runs below results/: results/report/index.html

@@ -185,11 +185,11 @@ def draw_frames() -> str:
     _draw_axes(parts, 80, 220, "cam")
     parts.append(text(160, 250, "camera frame, mm:", kind="quiet", anchor="start", size=14))
     parts.append(text(160, 268, "x right, y down, z forward", kind="quiet", anchor="start", size=14))
-    parts.append(arrow(150, 220, 330, 220))
+    parts.append(arrow(150, 220, 322, 220))
     parts.append(text(240, 212, "K"))
-    parts += _image(340, 162) + _crop(340, 330)
-    parts.append(arrow(432, 256, 432, 326))
-    parts.append(text(444, 312, "A_crop_img", anchor="start"))
+    parts += _image(330, 162) + _crop(330, 330)
+    parts.append(arrow(422, 256, 422, 326))
+    parts.append(text(434, 312, "A_crop_img", anchor="start"))
     parts.append(text(24, 356, "p_cam = T_cam_obj p_obj", anchor="start"))
     parts.append(text(24, 384, "K_crop = A_crop_img K", anchor="start"))
     parts.append(text(24, 424, "cell (i, j) of a map with stride s", kind="quiet", anchor="start", size=14))
@@ -222,7 +222,7 @@ def _crop(x: float, y: float) -> list[str]:
     grid = "".join(f"M{x + s} {y}v128M{x} {y + s}h128" for s in range(16, 128, 16))
     notes = [
         text(x + 140, y + 60, "crop: 128 x 128 px", kind="quiet", anchor="start", size=14),
-        text(x + 140, y + 78, "cell: of a feature map", kind="quiet", anchor="start", size=14),
+        text(x + 140, y + 78, "cells of a feature map", kind="quiet", anchor="start", size=14),
     ]
     return [box(x, y, 128, 128, kind="layer"), blob, f'<path class="line" stroke-width="0.7" d="{grid}"/>', *notes]
 

@@ -17,8 +17,14 @@ TINY = (
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tmp_path_factory.mktemp("data")
+def folder(tmp_path_factory):
+    """The page's files, and a store that its examples share."""
+    folder = tmp_path_factory.mktemp("extending")
+    for name, text in FILES:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    (folder / "mine" / "__init__.py").touch()
+    return folder
 
 
 def test_the_page_has_a_file_of_each_kind():
@@ -27,17 +33,13 @@ def test_the_page_has_a_file_of_each_kind():
 
 
 @pytest.mark.parametrize("command", EXAMPLES, ids=str)
-def test_a_worked_example_runs(command, capsys, monkeypatch, tmp_path, data):
-    for name, text in FILES:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    (tmp_path / "mine" / "__init__.py").touch()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
+def test_a_worked_example_runs(command, capsys, monkeypatch, folder, tmp_path):
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
     arguments = command.words[command.words.index("pipeline") + 1 :]
-    ran = run_dzop(capsys, monkeypatch, *arguments, *TINY, f"dataset.root={data}", f"store.root={data / 'cache'}")
+    ran = run_dzop(capsys, monkeypatch, *arguments, *TINY, f"out={tmp_path}")
     assert ran.status == 0, ran.err
-    record = json.loads(next((tmp_path / "results").glob("*/*/poses.json")).read_text())
+    record = json.loads(next(tmp_path.glob("*/*/poses.json")).read_text())
     chosen = [argument.split("=") for argument in arguments if "=" in argument]
     assert all(f"mine.{name}." in record["config"][stage]["_target_"] for stage, name in chosen)
     assert [answer["status"] for answer in record["answers"]] == ["estimate"]

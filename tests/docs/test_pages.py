@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import tomllib
 
 import PIL.Image
 import pytest
@@ -114,3 +115,11 @@ def test_errors_in_readme_are_the_programs_own(capsys, monkeypatch, tmp_path):
         error = ran.err.strip().splitlines()[-1].removeprefix("error: ")
         assert ran.status == 1
         assert re.sub(r"diameter [\d.]+", "diameter 0.13", error) in shown
+
+
+def test_architecture_says_where_each_heavy_library_is_imported():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    protected = [contract for contract in contracts if contract["type"] == "protected"]
+    importers = {module for contract in protected for module in contract["allowed_importers"]} - {"benchmarks"}
+    assert [module for module in importers if module.replace(".", "/") not in page] == []
