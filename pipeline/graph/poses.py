@@ -86,14 +86,14 @@ class PoseNodes:
         self._make_queries(sorted({(t.scene_id, t.im_id) for group in missing for t in self.groups[group]}))
         total = sum(len(self.groups[group]) for group in missing)
         with self.context.progress.bar(total, "poses", "target") as advance:
-            self.context.run_task(self.solving, sorted(missing, key=lambda group: group[1]), advance)
+            self.context.run_task(self.solve_task, sorted(missing, key=lambda group: group[1]), advance)
         made = [self.context.store.read(self.poses(group)).document["answers"] for group in self.groups]
         records = [record for answers in made for record in answers]
         self.context.store.put_document(ref, {"answers": records}, rows=len(records))
 
     def _make_queries(self, images: Sequence[ImageId]) -> None:
         with self.context.progress.bar(len(images), "query features", "image") as advance:
-            self.context.run_task(self.queries.describing, images, advance)
+            self.context.run_task(self.queries.describe_task, images, advance)
 
     def _count_reused(self, answers: int) -> None:
         """Count as reused what this run needed and did not compute."""
@@ -103,7 +103,7 @@ class PoseNodes:
             self.context.progress.add(step, reused=max(0, rows - count.computed - count.reused))
 
     @cached_property
-    def solving(self) -> Task[tuple[int, int]]:
+    def solve_task(self) -> Task[tuple[int, int]]:
         """Poses, by scene and object."""
         done, size = self.context.store.is_complete, self.groups
         return Task("poses", self._solve, lambda group: done(self.poses(group)), lambda group: len(size[group]))

@@ -88,7 +88,7 @@ class QueryNodes:
         return self.context.features(layer, inputs)
 
     @cached_property
-    def describing(self) -> Task[ImageId]:
+    def describe_task(self) -> Task[ImageId]:
         """Crops and features of an image's detections, by image."""
         return Task("query features", self._make_image, self._has_image)
 

@@ -218,7 +218,7 @@ class TemplateNodes:
         return TemplateCells(torch.cat(features), torch.cat(template), crops.rows)
 
     @cached_property
-    def onboarding(self) -> Task[int]:
+    def onboard_task(self) -> Task[int]:
         """The offline steps, by object."""
         return Task("onboarding", self._onboard, self._is_onboarded)
 

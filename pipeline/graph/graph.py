@@ -1,0 +1,120 @@
+"""The graph of one run: its nodes, its steps and its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from pipeline.errors import BadInput
+from pipeline.graph.checks import check_layers, detection_warnings
+from pipeline.graph.context import Context
+from pipeline.graph.detections import DetectionNodes
+from pipeline.graph.memory import Memory, estimate_peak, fit_to_budgets
+from pipeline.graph.memory_needs import estimate_needs
+from pipeline.graph.plan import Node, Plan
+from pipeline.graph.poses import PoseNodes
+from pipeline.graph.proposals import proposal_nodes
+from pipeline.graph.queries import QueryNodes
+from pipeline.graph.replay import Replayer
+from pipeline.graph.scores import ScoreNodes
+from pipeline.graph.tasks import Counts, Task
+from pipeline.graph.templates import TemplateNodes
+from pipeline.items.records import Answer
+from pipeline.items.views import Detection
+from pipeline.scoring import Scorer
+
+
+class Graph:
+    """All nodes of one run."""
+
+    def __init__(self, context: Context) -> None:
+        self.context = context
+        self.templates = TemplateNodes(context)
+        self.detections = DetectionNodes(context, proposal_nodes(context))
+        self.queries = QueryNodes(context, self.detections)
+        self.poses = PoseNodes(context, self.templates, self.queries)
+
+    def check(self) -> None:
+        """Check device, budgets, weights and layers before anything is computed. Raises BadInput."""
+        runtime, stages = self.context.runtime, self.context.stages
+        runtime.torch_device()
+        _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for what is not a size
+        stages.fuse.check(stages.extract.model)
+        check_layers(stages)
+        if self.detections.proposals:
+            if where := self.context.dataset.location_field:
+                raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
+            self.detections.proposals.check()
+        self.templates.views = fit_to_budgets(self.context, self.detections.proposals)
+
+    def memory(self, *, passes: bool) -> tuple[Memory, Memory | None]:
+        """Estimated peak memory of the machine, and of the device if that is a GPU.
+
+        ``passes`` says whether any image has to pass through a backbone.
+        """
+        needs = estimate_needs(self.context, self.detections.proposals)
+        return estimate_peak(self.context, needs if passes else replace(needs, weights=0, footprint=None))
+
+    def limit_vram(self) -> None:
+        """Limit torch's allocator, including the memory it caches, to ``runtime.max_vram``."""
+        vram, device = self.context.runtime.vram_bytes, self.context.device
+        if vram is not None and device.startswith("cuda"):
+            total = torch.cuda.get_device_properties(device).total_memory
+            torch.cuda.set_per_process_memory_fraction(min(1.0, vram / total), device)
+
+    # --- steps -------------------------------------------------------------------------------------------------------
+
+    def onboard(self) -> None:
+        """Compute everything that needs no image, for every object of the targets."""
+        tasks = [self.templates.onboard_task]
+        if self.detections.proposals and not self.detections.known:
+            tasks.append(self.detections.proposals.describe_task)
+        object_ids = self.context.object_ids
+        with self.context.progress.bar(len(tasks) * len(object_ids), "onboarding", "object") as advance:
+            for task in tasks:
+                self.context.run_task(task, object_ids, advance)
+
+    def detect(self) -> list[Detection]:
+        """Detections of all targets, including those that cannot be used."""
+        return self.detections.all
+
+    def warnings(self) -> list[str]:
+        """Results of sanity checks on the detections, one line each."""
+        return detection_warnings(self.context, self.detect())
+
+    def estimate(self) -> list[Answer]:
+        """An answer for every detection of every target, and for every target without one."""
+        # Read detections and meshes first: an error in their files must not appear after hours of onboarding.
+        self.detect()
+        if not self.context.store.is_complete(self.poses.run_ref()):
+            for obj_id in self.context.object_ids:
+                self.context.model(obj_id)
+        self.onboard()
+        return self.poses.estimate()
+
+    def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
+        """The node of the poses' scores, optionally with those of the correspondences they were solved from."""
+        replayer = self.replayer() if correspondences else None
+        return ScoreNodes(self.context, self.templates, self.poses, scorer, replayer)
+
+    def replayer(self) -> Replayer:
+        """Recomputes how an answer came about, from stored features."""
+        return Replayer(self.templates, self.queries, self.poses)
+
+    def run_item(self, task: str, item: Any) -> Counts:
+        """Run one item of the task with this name, in a worker; returns the counts of its steps."""
+        tasks: list[Task[Any]] = [self.templates.onboard_task, self.queries.describe_task, self.poses.solve_task]
+        if self.detections.proposals:
+            tasks += [self.detections.proposals.describe_task, self.detections.proposals.propose_task]
+        if task in (self.queries.describe_task.name, self.poses.solve_task.name):
+            self.detect()  # not part of the item's counts
+        self.context.progress.counts.clear()
+        next(t for t in tasks if t.name == task).do(item, lambda steps: None)
+        return dict(self.context.progress.counts)
+
+    def plan(self) -> Iterator[Node]:
+        """Every node with its state, key, size and cost. Raises NotDownloaded at a key that missing weights decide."""
+        return Plan(self.context, self.templates, self.queries, self.poses, self.detections).nodes()
