@@ -112,9 +112,9 @@ def _print_plan(graph: Graph, options: Options) -> None:
         return
     print(plan_costs(nodes))
     machine, device = graph.memory(passes=any(node.passes for node in nodes))
-    print(f"memory  about {machine.text()} at peak")
+    print(f"memory  peak of about {machine.text()}")
     if device is not None:
-        print(f"vram    about {device.text()} at peak")
+        print(f"vram    peak of about {device.text()}")
 
 
 def _detect(graph: Graph, options: Options) -> None:
