@@ -123,3 +123,18 @@ def test_architecture_says_where_each_heavy_library_is_imported():
     protected = [contract for contract in contracts if contract["type"] == "protected"]
     importers = {module for contract in protected for module in contract["allowed_importers"]} - {"benchmarks"}
     assert [module for module in importers if module.replace(".", "/") not in page] == []
+
+
+def test_modules_that_changelog_says_are_there_now_exist():
+    rows = re.findall(r"^\| .+ \| (.+) \|$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    modules = re.findall(r"`((?:pipeline|benchmarks)[\w.]+)`", " ".join(rows))
+    paths = [ROOT / module.replace(".", "/") for module in modules]
+    assert len(paths) > 20
+    assert [path for path in paths if not (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())] == []
+
+
+def test_the_workflow_runs_every_python_that_the_package_takes():
+    requires = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    low, high = (int(minor) for minor in re.findall(r"3\.(\d+)", requires))
+    listed = re.findall(r'"3\.(\d+)"', (ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    assert [int(minor) for minor in listed] == list(range(low, high))
