@@ -1,1 +1,1 @@
-"""How fast each part is against a named reference in the same run, and which targets it meets: ``make bench``."""
+"""Speed of each part compared with a reference in the same run (make bench), and accuracy (make benchmark-embedded)."""

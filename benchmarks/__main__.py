@@ -1,4 +1,7 @@
-"""``python -m benchmarks``: figures as JSON, and a table of targets with pass or what is missing."""
+"""Measure the speed and memory of the pipeline's parts, compared with references and with targets.
+
+Prints a table per part, then all targets with pass or the factor that is missing; writes all measurements as JSON.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.extraction import extraction, extraction_sd
 from benchmarks.jobs import memory, onboarding, warm
-from benchmarks.measure import Figure, machine, table
+from benchmarks.measure import Measurement, describe_machine, table
 from benchmarks.online import online
 from benchmarks.rendering import rendering
 from benchmarks.storing import storing
 from pipeline.io.files import write_json
 
-PARTS: dict[str, Callable[..., list[Figure]]] = {
+PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "online": online,
     "store": storing,
     "render": rendering,
@@ -29,33 +32,34 @@ PARTS: dict[str, Callable[..., list[Figure]]] = {
     "memory": memory,
     "extract-sd": extraction_sd,
 }
-ASKED = ("extract-sd",)  # for by name alone
+ON_REQUEST = ("extract-sd",)  # measured only if named
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Parse the options, measure, print and write the results."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all but {ASKED[0]} where none is named")
-    parser.add_argument("--json", type=Path, default=Path("results/bench.json"), help="where the figures go")
-    parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:N")
-    parser.add_argument("--repeats", type=int, default=7, help="turns of which medians are taken")
-    parser.add_argument("--threads", type=int, default=1, help="of torch and OpenCV; 1 on a machine that others use")
+    add, default = parser.add_argument, "(default: %(default)s)"
+    add("parts", nargs="*", help=f"parts to measure: {', '.join(PARTS)} (default: all except {ON_REQUEST[0]})")
+    add("--json", type=Path, default=Path("results/bench.json"), help=f"file for the measurements {default}")
+    add("--device", default="cpu", help=f"cpu, cuda or cuda:N {default}")
+    add("--repeats", type=int, default=7, help=f"repetitions; medians are reported {default}")
+    add("--threads", type=int, default=1, help=f"CPU threads; use 1 on a shared machine {default}")
     args = parser.parse_args()
     if unknown := sorted(set(args.parts) - set(PARTS)):
-        parser.error(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
-    threadpool_limits(args.threads)  # BLAS beneath numpy, SciPy and scikit-learn
+        parser.error(f"parts: found {', '.join(unknown)}, needs some of {', '.join(PARTS)}")
+    threadpool_limits(args.threads)  # of BLAS in numpy, SciPy and scikit-learn
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
-    facts = machine(args.device)
-    print(json.dumps(facts), flush=True)
-    figures: list[Figure] = []
-    for name in args.parts or [part for part in PARTS if part not in ASKED]:
+    description = describe_machine(args.device)
+    print(json.dumps(description), flush=True)
+    measurements: list[Measurement] = []
+    for name in args.parts or [part for part in PARTS if part not in ON_REQUEST]:
         found = PARTS[name](device=args.device, repeats=args.repeats)
         print(f"\n{name}\n{table(found)}", flush=True)
-        figures += found
-    aimed = [figure for figure in figures if figure.target is not None]
-    print(f"\ntargets: {sum(f.verdict == 'pass' for f in aimed)} of {len(aimed)} met\n{table(aimed)}")
-    write_json(args.json, {"machine": facts, "figures": [figure.record() for figure in figures]})
+        measurements += found
+    with_target = [m for m in measurements if m.target is not None]
+    print(f"\ntargets: {sum(m.verdict == 'pass' for m in with_target)} of {len(with_target)} met\n{table(with_target)}")
+    write_json(args.json, {"machine": description, "figures": [m.to_record() for m in measurements]})
     print(f"written   {args.json}")
 
 

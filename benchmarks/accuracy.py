@@ -1,28 +1,30 @@
-"""One table: the embedded model beside its controls, on objects of a seed that nothing was trained or chosen on."""
+"""Accuracy of the embedded model compared with control features, as tables in Markdown.
+
+The procedural test objects use a seed that was not used for training or for choosing options. With --lmo, the same
+table is made on photographs. Runs are cached; run the same command again to resume an interrupted benchmark.
+"""
 
 from __future__ import annotations
 
 import argparse
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from joblib import cpu_count
 
+from benchmarks.run_pool import run_all
 from pipeline.errors import DzopError
-from pipeline.items.scores import Scores
-from pipeline.metrics.bootstrap import Interval, image_index, mean_interval
+from pipeline.metrics.bootstrap import image_index, mean_interval
 from pipeline.metrics.recall import instance_recalls
 from pipeline.report.run_records import RunRecord, read_run_records
 from pipeline.spec import digest
 
-TEST_SEED = 9041  # of synthetic.demo; training and validation objects have builders and seeds of their own
+TEST_SEED = 9041  # of synthetic.demo; training and validation objects come from other generators and seeds
 DEMO = ("dataset=demo", f"dataset.seed={TEST_SEED}", "dataset.objects=20", "dataset.images=40", "dataset.per_image=5")
 OURS = "embedded, learned and edges"
+# in the order in which they are run: systems that share features are next to each other
 SYSTEMS = {
     OURS: ("extract=embedded",),
     "embedded, pure": ("extract=embedded", "extract.weights=pure"),
@@ -30,8 +32,8 @@ SYSTEMS = {
     "pixels": ("extract=pixels",),
     "HOG": ("extract=hog",),
     "embedded, learned alone": ("extract=embedded", "fuse=learned", "fuse.layers=[2,5,8,11]"),
-}  # in the order they run in: those that share features do so one after the other
-TEMPLATES = {
+}
+TEMPLATE_COLUMNS = {
     "Acc15_geodesic": "Acc15",
     "template_error_geodesic_deg": "template error, deg",
     "correspondence_error_percent": "correspondence error, % of diameter",
@@ -48,118 +50,89 @@ def benchmark(
     jobs: int | None = None,
     overrides: Sequence[str] = (),
 ) -> str:
-    """Tables in Markdown; every run is cached, an interrupted benchmark goes on where it stopped.
+    """Run every system on every data set; returns the tables in Markdown.
 
-    ``jobs`` runs at a time share the cores; None: one for each core. ``overrides`` are those of ``python -m pipeline``,
-    for every row alike. Raises DzopError for a run that failed.
+    ``jobs``: runs at a time, which share the CPU cores; None: one per core. ``overrides``: for ``python -m pipeline``,
+    applied to all runs. Raises DzopError if a run failed.
     """
-    parts: dict[str, tuple[str, ...]] = {"objects of the test seed": (*DEMO, _at("dataset.root", folder / "data"))}
-    if lmo is not None:
-        parts["LM-O, visible masks"] = ("dataset=lmo", _at("dataset.root", lmo), "evaluate.vsd=false")
-        if detections is not None:
-            found = ("detect=json", _at("detect.path", detections))
-            parts["LM-O, detections"] = (*parts["LM-O, visible masks"], *found)
+    datasets = _dataset_overrides(folder, lmo, detections)
     results = folder / "results" / digest(list(overrides))[:8] if overrides else folder / "results"
     cores = cpu_count()
-    jobs = min(jobs or cores, len(parts) * len(SYSTEMS))
-    shared = [*QUIET, f"threads={max(1, cores // jobs)}", _at("store.root", folder / "cache")]
-    outs = {(title, name): results / _folder(title) / _folder(name) for title in parts for name in SYSTEMS}
-    choices = {
-        (title, name): ["method=dzop_x", *SYSTEMS[name], *shared, *parts[title], *overrides, _at("out", out)]
+    jobs = min(jobs or cores, len(datasets) * len(SYSTEMS))
+    shared = [*QUIET, f"threads={max(1, cores // jobs)}", _path_override("store.root", folder / "cache")]
+    outs = {(title, name): results / _folder_name(title) / _folder_name(name) for title in datasets for name in SYSTEMS}
+    overrides_of = {
+        (title, name): [
+            "method=dzop_x",
+            *SYSTEMS[name],
+            *shared,
+            *datasets[title],
+            *overrides,
+            _path_override("out", out),
+        ]
         for (title, name), out in outs.items()
     }
-    _run_all(choices, jobs=jobs)
-    rows = {run: max(read_run_records(out), key=lambda row: row.at) for run, out in outs.items()}
-    return "\n\n".join(_table(title, {name: rows[title, name] for name in SYSTEMS}) for title in parts)
+    run_all(overrides_of, jobs=jobs)
+    newest = {run: max(read_run_records(out), key=lambda record: record.at) for run, out in outs.items()}
+    return "\n\n".join(_table(title, {name: newest[title, name] for name in SYSTEMS}) for title in datasets)
 
 
-def _run_all(choices: Mapping[tuple[str, str], Sequence[str]], *, jobs: int) -> None:
-    """Runs of the pipeline, ``jobs`` at a time, with a line for each that has ended.
-
-    The first that fails ends the others, as Ctrl-C does; what is complete in the cache is kept. Raises DzopError.
-    """
-    waiting, running = list(choices), dict[tuple[str, str], tuple[subprocess.Popen[bytes], float]]()
-    interrupts: list[int] = []  # heeded below, not wherever they come: a run just started would be known to nobody
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:
-        signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
-    try:
-        while waiting or running:
-            while waiting and len(running) < jobs:
-                command = [sys.executable, "-m", "pipeline", *choices[waiting[0]], "runtime.progress=false"]
-                started = subprocess.Popen(command, stdout=subprocess.DEVNULL, process_group=0)
-                running[waiting.pop(0)] = started, time.perf_counter()
-            time.sleep(0.1)
-            if interrupts:
-                raise KeyboardInterrupt
-            for run in [run for run, (process, _) in running.items() if process.poll() is not None]:
-                process, start = running.pop(run)
-                if process.returncode:
-                    killed = f"was killed by signal {-process.returncode}, often for want of memory"
-                    why = killed if process.returncode < 0 else "failed, see above"
-                    raise DzopError(f"no table: {', '.join(run)}: the run {why}; the same command goes on from here")
-                print(f"{', '.join(run)}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-    finally:
-        for process, _ in running.values():
-            process.terminate()
-        for process, _ in running.values():
-            process.wait()
-        signal.signal(signal.SIGINT, before)
+def _dataset_overrides(folder: Path, lmo: Path | None, detections: Path | None) -> dict[str, tuple[str, ...]]:
+    """Title of a table -> overrides that choose its data."""
+    chosen: dict[str, tuple[str, ...]] = {
+        "objects of the test seed": (*DEMO, _path_override("dataset.root", folder / "data"))
+    }
+    if lmo is not None:
+        masks = ("dataset=lmo", _path_override("dataset.root", lmo), "evaluate.vsd=false")
+        chosen["LM-O, visible masks"] = masks
+        if detections is not None:
+            chosen["LM-O, detections"] = (*masks, "detect=json", _path_override("detect.path", detections))
+    return chosen
 
 
-def _table(title: str, rows: Mapping[str, RunRecord]) -> str:
-    """A row for each system: 95 % intervals over images in brackets, and by how much the first one leads."""
-    recalls = [k for k, name in enumerate(RECALLS) if rows[OURS].metrics.get(name) is not None]
-    heads = ["features", *TEMPLATES.values(), *(RECALLS[k] for k in recalls), "mean", f"lead of {OURS}"]
+def _table(title: str, records: Mapping[str, RunRecord]) -> str:
+    """One line per system, with 95 % intervals over images in brackets and the paired lead of the first system."""
+    recalls = [k for k, name in enumerate(RECALLS) if records[OURS].metrics.get(name) is not None]
+    heads = ["features", *TEMPLATE_COLUMNS.values(), *(RECALLS[k] for k in recalls), "mean", f"lead of {OURS}"]
     lines = [f"**{title}**", "", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for name, row in rows.items():
-        values = _recalls(row, recalls)
-        shown = [_shown(row.metrics.get(column)) for column in TEMPLATES]
-        shown += [_bracketed(v, row) for v in (*values.T, values.mean(axis=1))]
-        lead = "" if name == OURS else _bracketed((_recalls(rows[OURS], recalls) - values).mean(axis=1), row)
-        lines.append(f"| {name} | {' | '.join([*shown, lead])} |")
+    ours = _recalls(records[OURS], recalls)
+    for name, record in records.items():
+        values = _recalls(record, recalls)
+        cells = [_number_text(record.metrics.get(column)) for column in TEMPLATE_COLUMNS]
+        cells += [_interval_text(column, record) for column in (*values.T, values.mean(axis=1))]
+        cells.append("" if name == OURS else _interval_text((ours - values).mean(axis=1), record))
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def _at(field: str, path: Path) -> str:
-    """An override that holds whatever signs a path has."""
+def _path_override(field: str, path: Path) -> str:
+    """An override whose value is a path with any characters."""
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
     return f'{field}="{escaped}"'
 
 
-def _folder(name: str) -> str:
-    return name.replace(",", "").replace(" ", "_")
+def _folder_name(title: str) -> str:
+    return title.replace(",", "").replace(" ", "_")
 
 
-def _recalls(row: RunRecord, which: Sequence[int]) -> np.ndarray:
-    return instance_recalls(_scores(row))[:, which]
+def _recalls(record: RunRecord, which: Sequence[int]) -> np.ndarray:
+    """Recalls of each instance, (instances, metrics)."""
+    return instance_recalls(record.require_scores())[:, which]
 
 
-def _scores(row: RunRecord) -> Scores:
-    assert row.scores is not None
-    return row.scores
+def _interval_text(values: np.ndarray, record: RunRecord) -> str:
+    scores = record.require_scores()
+    interval = mean_interval(values, image_index(scores.scene_id, scores.im_id))
+    return f"{interval.mean:.3f} [{interval.low:.3f}, {interval.high:.3f}]"
 
 
-def _bracketed(values: np.ndarray, row: RunRecord) -> str:
-    scores = _scores(row)
-    found: Interval = mean_interval(values, image_index(scores.scene_id, scores.im_id))
-    return f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]"
-
-
-def _shown(value: float | None) -> str:
+def _number_text(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}" if value < 1 else f"{value:.1f}"
 
 
 def main() -> None:
-    """Parse, run, print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy", description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("cache/benchmark"), help="data, cache and results")
-    parser.add_argument("--lmo", type=Path, help="folder of LM-O, for the same table on photographs")
-    parser.add_argument("--detections", type=Path, help="a detector's json for LM-O, for the table once more")
-    parser.add_argument(
-        "--jobs", type=_positive, help="runs at a time, which share the cores; one a core where not given"
-    )
-    parser.add_argument("overrides", nargs="*", help="for all runs alike, such as second_look=none")
+    """Parse the options, run the benchmark, print the tables."""
+    parser = _parser()
     options = parser.parse_intermixed_args()
     folder, lmo, detections = options.folder.resolve(), options.lmo, options.detections
     if detections is not None and lmo is None:
@@ -173,7 +146,18 @@ def main() -> None:
     except DzopError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        sys.exit("interrupted: what was complete is kept, and the same command goes on from there")
+        sys.exit("interrupted. Completed entries are cached; run the same command again to resume")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy", description=__doc__)
+    add, default = parser.add_argument, "(default: %(default)s)"
+    add("--folder", type=Path, default=Path("cache/benchmark"), help=f"for data, cache and results {default}")
+    add("--lmo", type=Path, help="folder of LM-O, to make the table on photographs too")
+    add("--detections", type=Path, help="detections for LM-O (json), for a table with them")
+    add("--jobs", type=_positive, help="runs at a time, which share the CPU cores (default: one per core)")
+    add("overrides", nargs="*", help="overrides for all runs, such as second_look=none")
+    return parser
 
 
 def _positive(text: str) -> int:

@@ -1,4 +1,4 @@
-"""Images per second of the diffusion extractor against its U-Net and VAE called with nothing around them."""
+"""Images per second of the diffusion extractor compared with bare calls of its U-Net and VAE."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.measure import Figure, interleaved
+from benchmarks.measure import Measurement, time_interleaved
 from pipeline.backbones.determinism import use_deterministic_convolutions
 from pipeline.backbones.stable_diffusion.features import DiffusionBackbone, DiffusionFeatures
 from pipeline.items.views import Crops
@@ -27,40 +27,40 @@ SD_SIZE: dict[str, Any] = {
 
 
 class _Reached(Exception):
-    pass
+    """Stops the U-Net's forward pass."""
 
 
-def extraction(*, device: str, repeats: int) -> list[Figure]:
-    """The model that ships: share of the bare forward passes' speed."""
+def extraction(*, device: str, repeats: int) -> list[Measurement]:
+    """The embedded model: speed relative to bare forward passes."""
     return _extraction("the embedded model", Embedded(), device=device, repeats=repeats, images=8)
 
 
-def extraction_sd(*, device: str, repeats: int) -> list[Figure]:
-    """A model of SD 1.5's size with random weights: minutes on a CPU, asked for by name alone."""
-    images, turns = (16, repeats) if device.startswith("cuda") else (1, min(repeats, 3))
-    return _extraction("SD 1.5's size", RandomSD(**SD_SIZE), device=device, repeats=turns, images=images)
+def extraction_sd(*, device: str, repeats: int) -> list[Measurement]:
+    """A model of SD 1.5's size with random weights; takes minutes on a CPU."""
+    images, repeats = (16, repeats) if device.startswith("cuda") else (1, min(repeats, 3))
+    return _extraction("SD 1.5's size", RandomSD(**SD_SIZE), device=device, repeats=repeats, images=images)
 
 
-def _extraction(name: str, spec: DiffusionFeatures, *, device: str, repeats: int, images: int) -> list[Figure]:
+def _extraction(name: str, spec: DiffusionFeatures, *, device: str, repeats: int, images: int) -> list[Measurement]:
     backbone = spec.load(Runtime(device=device))
     rgb = np.random.default_rng(0).integers(0, 256, (images, 128, 128, 3), dtype=np.uint8)
     crops = Crops(rgb, np.ones((images, 128, 128), bool), np.repeat(np.eye(3)[None], images, 0))
-    took = interleaved(
+    times = time_interleaved(
         {"ours": lambda: backbone(crops, LAYERS), "bare": lambda: _bare(backbone, images)}, repeats=repeats
     )
-    seconds = {key: t.wall_s if device.startswith("cuda") else t.cpu_s for key, t in took.items()}
+    seconds = {key: t.wall_s if device.startswith("cuda") else t.cpu_s for key, t in times.items()}
     unit = "images/s" if device.startswith("cuda") else "images/s of one core"
     return [
-        Figure(f"images of {name}", images / seconds["ours"], unit),
-        Figure(
-            f"images of {name}", 100 * seconds["bare"] / seconds["ours"], "%", "VAE and U-Net alone", 95.0, "more"
+        Measurement(f"images of {name}", images / seconds["ours"], unit),
+        Measurement(
+            f"images of {name}", 100 * seconds["bare"] / seconds["ours"], "%", "bare VAE and U-Net", 95.0, "more"
         ),
     ]  # fmt: skip
 
 
 @torch.inference_mode()
 def _bare(backbone: DiffusionBackbone, images: int) -> None:
-    """Encoder and U-Net, up to the block that the deepest layer is read before, in the same maths."""
+    """VAE encoder and U-Net up to the block before which the deepest layer is read, at the same precision."""
     model, spec = backbone.model, backbone.spec
     like: dict[str, Any] = {"device": model.prompt.device, "dtype": model.prompt.dtype}
     vae: Any = model.vae

@@ -1,4 +1,4 @@
-"""Inputs of the size of Stable Diffusion's features, in which a pose can be found."""
+"""Synthetic inputs with the size of Stable Diffusion's features, from which a pose can be estimated."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from pipeline.stages.render.raycast import Raycast
 from pipeline.synthetic.objects import make_object
 
 SD15 = {2: (1280, 8), 5: (1280, 16), 8: (640, 32), 11: (320, 64)}
-"""layer -> channels and cells a side of SD 1.5's maps (hook=pre) at 512 px."""
+"""layer -> (channels, cells per side) of SD 1.5's maps (hook=pre) at 512 px."""
 
 TOY = {2: (96, 8), 5: (96, 16), 8: (64, 32), 11: (48, 64)}
-"""The same cells with few channels, for tests."""
+"""The same cells with fewer channels, for tests."""
 
 TEMPLATES = 300
-_NOISE = 0.5  # of the features' own standard deviation: template and query are no copies of one another
-_OBJECT = 1  # fills half of its crop: more cells than most
-_TURN_DEG = 8.0  # from the best template to the query
+_NOISE = 0.5  # standard deviations of the features; makes query and template differ
+_OBJECT = 1  # seed; fills half of its crop, more than most objects
+_TURN_DEG = 8.0  # between the best template and the query
 
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """Templates in memory, float16 as stored: ``views`` in full, the others by the match layer alone."""
+    """Templates in memory, float16 as in the store. ``views``: all layers of the first ones; others have layer 2."""
 
     features: Float[Tensor, "n c h w"]
     mask: Bool[Tensor, "n S S"]
@@ -58,11 +58,11 @@ class Bank:
     def draw(
         self, T_cam_obj: Float[np.ndarray, "4 4"], A_crop_img: Float[np.ndarray, "3 3"], K: Float[np.ndarray, "3 3"]
     ) -> TemplateView:
-        """Nothing is drawn here."""
+        """Not used by the benchmark."""
         raise NotImplementedError
 
     def fitted(self, fit: Fit) -> FittedArrays:
-        """Nothing is fitted here."""
+        """Not used by the benchmark."""
         raise NotImplementedError(fit.kind)
 
 
@@ -76,9 +76,9 @@ class Scene:
 
 
 def scene(shapes: Mapping[int, tuple[int, int]], *, device: str = "cpu", views: int = 4, seed: int = 0) -> Scene:
-    """A view of a procedural object, and ``TEMPLATES`` templates of which the first is the nearest.
+    """A query view of a procedural object, and ``TEMPLATES`` templates, the first of which is the nearest.
 
-    Features are Fourier features of the object points that cells see, mixed into the channels of each layer, and noise.
+    Features are random mixtures of Fourier features of the cells' object points, plus noise.
     """
     mesh, renderer = make_object(_OBJECT), Raycast(count=TEMPLATES, viewpoints="fibonacci")
     K, T_cam_obj, size_hw = renderer.cameras(mesh)
@@ -90,7 +90,7 @@ def scene(shapes: Mapping[int, tuple[int, int]], *, device: str = "cpu", views: 
     whole = (-0.5, -0.5, size_hw[1] - 0.5, size_hw[0] - 0.5)
     geometry = Geometry(list(depth_mm), np.repeat(K[None], len(poses), 0), poses)
     crops = Crops(**stack_crops([crop(rgb, depth > 0, whole, K) for depth in depth_mm]), geometry=geometry)
-    maps = {layer: m.to(device) for layer, m in _mixed(crops, shapes, seed=seed).items()}
+    maps = {layer: m.to(device) for layer, m in _mixed_features(crops, shapes, seed=seed).items()}
     masks = torch.from_numpy(crops.mask).to(device)
     each = [CropFeatures({layer: m[i] for layer, m in maps.items()}, masks[i]) for i in range(len(poses))]
     template = tuple(TemplateView(each[i], crops.A_crop_img[i], depth_mm[i], K, poses[i]) for i in range(1, len(poses)))
@@ -101,16 +101,16 @@ def scene(shapes: Mapping[int, tuple[int, int]], *, device: str = "cpu", views: 
     return Scene(Query(each[0], crops.A_crop_img[0], K), bank, T_true)
 
 
-def _mixed(crops: Crops, shapes: Mapping[int, tuple[int, int]], *, seed: int) -> dict[int, Tensor]:
-    """float16 maps of every layer's channels and cells, of unit variance on the object."""
+def _mixed_features(crops: Crops, shapes: Mapping[int, tuple[int, int]], *, seed: int) -> dict[int, Tensor]:
+    """float16 maps with the channels and cells of each layer, with unit variance on the object."""
     generator = torch.Generator().manual_seed(seed)
     found = Coordinates(bandwidth_mm=15.0).load(Runtime(device="cpu"))(crops, tuple(shapes))
     maps = {}
     for layer, (channels, cells) in shapes.items():
-        own = avg_pool2d(found[layer], found[layer].shape[-1] // cells)
-        mix = torch.randn((channels, own.shape[1]), generator=generator)
-        signal = torch.einsum("kc,nchw->nkhw", mix, own)
-        seen = (own.abs().sum(1, keepdim=True) > 0).float()
+        pooled = avg_pool2d(found[layer], found[layer].shape[-1] // cells)
+        mix = torch.randn((channels, pooled.shape[1]), generator=generator)
+        signal = torch.einsum("kc,nchw->nkhw", mix, pooled)
+        seen = (pooled.abs().sum(1, keepdim=True) > 0).float()
         noise = torch.randn(signal.shape, generator=generator)
         maps[layer] = (signal + _NOISE * noise * seen).half()
     return maps

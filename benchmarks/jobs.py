@@ -1,4 +1,4 @@
-"""Whole runs: what a warm job costs, what an object's onboarding costs, what `estimate` holds in memory."""
+"""Whole runs: time of a cached job, time of onboarding an object, peak memory of step=estimate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from benchmarks.measure import Figure, interleaved, peak_bytes
+from benchmarks.measure import Measurement, peak_bytes, time_interleaved
 from pipeline.configuration import CONF, build_options, build_stages, build_variant
 from pipeline.run import run
 from pipeline.store import Store
@@ -27,7 +27,7 @@ FEW, MANY = 2, 6
 
 
 def job(folder: Path, *overrides: str) -> None:
-    """One run, as the command line makes it; what it prints is dropped."""
+    """One run as from the command line, without its output."""
     places = (f"dataset.root={folder / 'data'}", f"store.root={folder / 'cache'}", f"out={folder / 'out'}")
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", [*places, *QUIET, f"threads={torch.get_num_threads()}", *overrides])
@@ -43,53 +43,55 @@ def job(folder: Path, *overrides: str) -> None:
         )
 
 
-def warm(*, device: str, repeats: int) -> list[Figure]:
-    """Seconds of a job of which everything is cached, beside a bare read of its configuration."""
+def warm(*, device: str, repeats: int) -> list[Measurement]:
+    """Seconds of a job for which everything is cached."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         chosen = (*SMALL, "extract=pixels", "render.count=12", f"runtime.device={device}")
         job(folder, *chosen)
-        took = interleaved(
+        times = time_interleaved(
             {"job": lambda: job(folder, *chosen), "estimate": lambda: job(folder, *chosen, "step=estimate")},
             repeats=repeats,
         )
     sized = "15 objects, 8 images, 24 targets"
     return [
-        Figure(f"warm job, step=all, {sized}", took["job"].cpu_s, "s of one core", "", 0.3),
-        Figure(f"warm job, step=estimate, {sized}", took["estimate"].cpu_s, "s of one core", "", 0.3),
+        Measurement(f"warm job, step=all, {sized}", times["job"].cpu_s, "s of one core", "", 0.3),
+        Measurement(f"warm job, step=estimate, {sized}", times["estimate"].cpu_s, "s of one core", "", 0.3),
     ]
 
 
-def onboarding(*, device: str, repeats: int) -> list[Figure]:
-    """Seconds per object: templates, crops and features of the embedded model."""
+def onboarding(*, device: str, repeats: int) -> list[Measurement]:
+    """Milliseconds per view of onboarding one object with the embedded model."""
     chosen = ("dataset=demo", "dataset.objects=1", "dataset.images=1", "dataset.per_image=1", "step=onboard")
     views, seconds = 24, []
     with tempfile.TemporaryDirectory() as name:
-        for turn in range(2):  # the first makes the data and loads the model's files
+        for run_number in range(2):  # the first run generates the data and loads the model
             start = time.process_time()
-            job(Path(name), *chosen, f"render.count={views + turn}", f"runtime.device={device}")
+            job(Path(name), *chosen, f"render.count={views + run_number}", f"runtime.device={device}")
             seconds.append(time.process_time() - start)
     return [
-        Figure("onboarding, one object, embedded model", 1e3 * seconds[-1] / (views + 1), "ms of one core per view")
+        Measurement(
+            "onboarding, one object, embedded model", 1e3 * seconds[-1] / (views + 1), "ms of one core per view"
+        )
     ]
 
 
-def memory(*, device: str, repeats: int) -> list[Figure]:
-    """Peak of step=estimate with few and with many objects, each in a process of its own.
+def memory(*, device: str, repeats: int) -> list[Measurement]:
+    """Peak memory of step=estimate with few and with many objects, each measured in its own process.
 
-    ``features cached``: the same with another parameter of correspondences, so that poses alone are computed.
+    "features cached": with another setting for correspondences, so that only poses are computed.
     """
     with tempfile.TemporaryDirectory() as name:
         peaks = {objects: _peak_mb(Path(name) / str(objects), objects, device, 10) for objects in (FEW, MANY)}
         again = {objects: _peak_mb(Path(name) / str(objects), objects, device, 9) for objects in (FEW, MANY)}
-    figures = []
-    for title, of in (("nothing cached", peaks), ("features cached", again)):
-        grown = (of[MANY] - of[FEW]) / (MANY - FEW)
-        figures += [
-            Figure(f"peak memory of estimate, {MANY} objects, {title}", of[MANY], "MB"),
-            Figure(f"memory each further object adds, {title}", grown, "MB", f"{FEW} objects", 2.0),
+    measurements = []
+    for title, peak_of in (("nothing cached", peaks), ("features cached", again)):
+        grown = (peak_of[MANY] - peak_of[FEW]) / (MANY - FEW)
+        measurements += [
+            Measurement(f"peak memory of estimate, {MANY} objects, {title}", peak_of[MANY], "MB"),
+            Measurement(f"memory per additional object, {title}", grown, "MB", f"{FEW} objects", 2.0),
         ]
-    return figures
+    return measurements
 
 
 def _peak_mb(folder: Path, objects: int, device: str, per_cluster: int) -> float:
@@ -100,13 +102,13 @@ def _peak_mb(folder: Path, objects: int, device: str, per_cluster: int) -> float
 
 
 def _estimate(folder: str, objects: str, device: str, per_cluster: str) -> None:
-    """In a process of its own: estimate, and print the most memory that was resident."""
+    """Run step=estimate in this process, and print its peak memory as JSON."""
     torch.set_num_threads(1)
     size = ("dataset=demo", f"dataset.objects={objects}", f"dataset.images={objects}", "dataset.per_image=1")
     chosen = ("extract=coordinates", "method=dzop", "render.count=16", "step=estimate", f"runtime.device={device}")
     if not (Path(folder) / "done").exists():
         Path(folder).mkdir(parents=True)
-        job(Path(folder), *size, "extract=pixels", "render.count=2", "step=detect")  # makes the data set
+        job(Path(folder), *size, "extract=pixels", "render.count=2", "step=detect")  # generates the data set
     job(Path(folder), *size, *chosen, f"correspond.per_cluster={per_cluster}")
     (Path(folder) / "done").touch()
     print(json.dumps({"peak_mb": peak_bytes() / 2**20}))

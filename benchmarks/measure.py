@@ -1,37 +1,39 @@
-"""Times that survive a busy machine: CPU seconds beside wall seconds, medians, and contestants that take turns."""
+"""Timing on a shared machine: CPU and wall seconds, medians, candidates measured in turn."""
 
 from __future__ import annotations
 
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import psutil
 import torch
 
+K = TypeVar("K", bound=Hashable)
+
 
 def peak_bytes() -> int:
-    """The most memory of this process that was resident (Linux). getrusage's would begin with its parent's peak."""
+    """Peak resident memory of this process, bytes (Linux). getrusage would start from the parent's peak."""
     status = Path("/proc/self/status").read_text()
     return 1024 * int(status.split("VmHWM:")[1].split()[0])
 
 
 @dataclass(frozen=True)
 class Times:
-    """Medians of one contestant, in seconds. ``cpu_s``: of all of this process's threads together."""
+    """Median times of one candidate. ``cpu_s``: of all threads of this process together."""
 
     cpu_s: float
     wall_s: float
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A measured value, what it was measured against, and the target it has to meet (None: none is set)."""
+class Measurement:
+    """A measured value, the reference it is relative to ("": absolute), and its target, if it has one."""
 
     name: str
     value: float
@@ -42,7 +44,7 @@ class Figure:
 
     @property
     def verdict(self) -> str:
-        """``pass``, or by how much the target is missed; "" where there is none."""
+        """``pass``, or by how much the target is missed; "" without a target."""
         if self.target is None:
             return ""
         if self.value <= self.target if self.better == "less" else self.value >= self.target:
@@ -50,32 +52,32 @@ class Figure:
         factor = self.value / self.target if self.better == "less" else self.target / max(self.value, 1e-12)
         return f"short by a factor of {factor:.2f}"
 
-    def record(self) -> dict[str, Any]:
-        """JSON-able."""
+    def to_record(self) -> dict[str, Any]:
+        """The fields and the verdict, for JSON."""
         return {**vars(self), "verdict": self.verdict}
 
 
-def interleaved(contestants: Mapping[str, Callable[[], object]], *, repeats: int) -> dict[str, Times]:
-    """Medians of contestants that take turns, so that whatever else runs here disturbs all of them alike.
+def time_interleaved(candidates: Mapping[K, Callable[[], object]], *, repeats: int) -> dict[K, Times]:
+    """Median times of candidates that are run in turn, so that other load on the machine affects all of them equally.
 
-    The first turn warms caches and is not counted.
+    The first round warms caches and is not counted.
     """
-    seen: dict[str, list[tuple[float, float]]] = {name: [] for name in contestants}
-    for turn in range(repeats + 1):
-        for name, contestant in contestants.items():
+    times: dict[K, list[tuple[float, float]]] = {name: [] for name in candidates}
+    for round_ in range(repeats + 1):
+        for name, candidate in candidates.items():
             cpu, wall = time.process_time(), time.perf_counter()
-            contestant()
+            candidate()
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
-            if turn:
-                seen[name].append((time.process_time() - cpu, time.perf_counter() - wall))
+            if round_:
+                times[name].append((time.process_time() - cpu, time.perf_counter() - wall))
     return {
-        name: Times(*(float(np.median(column)) for column in zip(*rows, strict=True))) for name, rows in seen.items()
+        name: Times(*(float(np.median(column)) for column in zip(*rows, strict=True))) for name, rows in times.items()
     }
 
 
-def machine(device: str) -> dict[str, Any]:
-    """What a figure has to be read with."""
+def describe_machine(device: str) -> dict[str, Any]:
+    """Hardware and library versions that the measurements depend on."""
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
@@ -97,12 +99,12 @@ def _cpu_model() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "?")
 
 
-def table(figures: list[Figure]) -> str:
-    """A line for each figure."""
-    heads = ("what", "measured", "target", "verdict", "against")
+def table(measurements: list[Measurement]) -> str:
+    """One line per measurement."""
+    heads = ("what", "measured", "target", "verdict", "compared with")
     rows = [heads]
-    for figure in figures:
-        sign = "" if figure.target is None else f"{'<=' if figure.better == 'less' else '>='} {figure.target:g}"
-        rows.append((figure.name, f"{figure.value:.4g} {figure.unit}", sign, figure.verdict, figure.against))
+    for m in measurements:
+        sign = "" if m.target is None else f"{'<=' if m.better == 'less' else '>='} {m.target:g}"
+        rows.append((m.name, f"{m.value:.4g} {m.unit}", sign, m.verdict, m.against))
     widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
     return "\n".join("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows)

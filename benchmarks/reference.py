@@ -1,8 +1,8 @@
-"""The paper's online path, written plainly with scikit-learn, SciPy and OpenCV: what is timed against, and the oracle.
+"""The paper's online path, written plainly with scikit-learn, SciPy and OpenCV; reference for speed and correctness.
 
 Von Gimborn et al., "Diffusion Features for Zero-Shot 6DoF Object Pose Estimation", in the reading of
-``method=dzop_sd``: the defaults of match=cosine, fuse=pca, cluster=kmeans, correspond=cosine and solve=epnp. Nothing
-here is shared with the package, arrays are numpy's, and clarity goes before speed.
+``method=dzop_sd``: the defaults of match=cosine, fuse=pca, cluster=kmeans, correspond=cosine and solve=epnp. It shares
+no code with the package, uses numpy arrays, and prefers clarity to speed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def retrieve(query: Map, bank: Float[np.ndarray, "n c h w"]) -> Float[np.ndarray
 
 
 def cell_mask(mask: Bool[np.ndarray, "S S"], cells: int) -> Cells:
-    """Cells at least half covered."""
+    """Cells of which at least half is covered."""
     return cv2.resize(mask.astype(np.float64), (cells, cells), interpolation=cv2.INTER_AREA) >= 0.5 - 1e-5
 
 
@@ -66,7 +66,7 @@ def co_project(
 def k_means(
     points: Float[np.ndarray, "m c"], *, count: int, seed: int, iterations: int
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "k c"]]:
-    """Labels and centres: k-means++ as its paper has it (Arthur and Vassilvitskii, SODA 2007), then scikit-learn."""
+    """Labels and centres: k-means++ initialisation (Arthur and Vassilvitskii, SODA 2007), then scikit-learn."""
     draws = np.random.default_rng(seed).random(count)
     chosen = [min(int(draws[0] * len(points)), len(points) - 1)]
     nearest = cdist(points, points[chosen], "sqeuclidean")[:, 0]
@@ -85,14 +85,14 @@ def k_means(
 def pair_clusters(
     query_centres: Float[np.ndarray, "k c"], template_centres: Float[np.ndarray, "l c"]
 ) -> Int[np.ndarray, "p 2"]:
-    """Clusters that are each other's most similar."""
+    """Pairs of clusters that are mutual nearest neighbours."""
     similarity = cosine_similarity(query_centres, template_centres)
     best, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
     return np.array([(i, j) for i, j in enumerate(best) if back[j] == i])
 
 
-def consistent(a: Float[np.ndarray, "p 2"], b: Float[np.ndarray, "p 2"], *, threshold: float, seed: int) -> Cells:
-    """Pairs that a fundamental matrix keeps; all of them where a homography explains the pairs as well."""
+def consistent_pairs(a: Float[np.ndarray, "p 2"], b: Float[np.ndarray, "p 2"], *, threshold: float, seed: int) -> Cells:
+    """Mask of pairs consistent with a fundamental matrix; all pairs if a homography explains them about as well."""
     order = np.random.default_rng(seed).permutation(len(a))
     everything = np.ones(len(a), dtype=bool)
     if len(a) < 8:
@@ -107,7 +107,7 @@ def consistent(a: Float[np.ndarray, "p 2"], b: Float[np.ndarray, "p 2"], *, thre
 
 
 def label_map(features: Map, mask: Cells, *, count: int, seed: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cluster of each cell, -1 outside the mask, and the clusters' centres; features are scaled to unit length."""
+    """Cluster of each cell, -1 outside the mask, and the cluster centres; features are normalised to unit length."""
     labels, centres = k_means(normalize(cells_inside(features, mask)), count=count, seed=seed, iterations=iterations)
     found = np.full(mask.shape, -1)
     found[mask] = labels
@@ -117,7 +117,7 @@ def label_map(features: Map, mask: Cells, *, count: int, seed: int, iterations: 
 def cluster(
     query: Map, template: Map, query_mask: Cells, template_mask: Cells, *, count: int = 200, iterations: int = 20
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels of both maps and the pairs of clusters."""
+    """Labels of both maps, and the matched pairs of clusters."""
     query_label, query_centres = label_map(query, query_mask, count=count, seed=0, iterations=iterations)
     template_label, template_centres = label_map(template, template_mask, count=count, seed=0, iterations=iterations)
     pairs = pair_clusters(query_centres, template_centres)
@@ -125,7 +125,7 @@ def cluster(
         np.array([np.argwhere(label == k)[:, ::-1].mean(axis=0) for k in pairs[:, side]])
         for side, label in enumerate((query_label, template_label))
     ]
-    return query_label, template_label, pairs[consistent(*middle, threshold=2.0, seed=0)]
+    return query_label, template_label, pairs[consistent_pairs(*middle, threshold=2.0, seed=0)]
 
 
 def sub_pixel(
@@ -154,7 +154,7 @@ def correspond(
     crop_size: int,
     per_cluster: int = 10,
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Crop pixels in query and template: of each pair of clusters the best mutual neighbours."""
+    """Crop pixels in query and template: the most similar mutual nearest neighbours of each cluster pair."""
     q = normalize(query.reshape(len(query), -1).T).reshape(*query.shape[1:], -1)
     t = normalize(template.reshape(len(template), -1).T).reshape(*template.shape[1:], -1)
     stride = crop_size / query.shape[-1]
@@ -165,8 +165,8 @@ def correspond(
             np.argwhere(template_label == template_cluster),
         )
         similarity = cosine_similarity(q[tuple(query_cells.T)], t[tuple(template_cells.T)])
-        there, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-        found = [(similarity[i, j], i, j) for i, j in enumerate(there) if back[j] == i and similarity[i, j] > 0]
+        forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+        found = [(similarity[i, j], i, j) for i, j in enumerate(forward) if back[j] == i and similarity[i, j] > 0]
         found.sort(key=lambda match: -match[0])
         for _, i, j in found[:per_cluster]:
             (y, x), (row, column) = query_cells[i], template_cells[j]
@@ -184,7 +184,7 @@ def object_point(
     K: Float[np.ndarray, "3 3"],
     T_cam_obj: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " 3"]:
-    """What a template's crop pixel shows (mm), NaN where it shows nothing."""
+    """Object point (mm) at a pixel of a template's crop; NaN in the background."""
     x, y, w = np.linalg.inv(A_crop_img) @ [*px_crop, 1.0]
     x, y = x / w, y / w
     depth = float(depth_mm[int(np.floor(y + 0.5)), int(np.floor(x + 0.5))])
@@ -195,7 +195,7 @@ def object_point(
 def solve(
     points_obj: Float[np.ndarray, "m 3"], px: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"], *, seed: int = 0
 ) -> Float[np.ndarray, "4 4"]:
-    """RANSAC EPnP and Levenberg-Marquardt on its inliers, three times over."""
+    """RANSAC EPnP, then three rounds of Levenberg-Marquardt on the inliers."""
     order = np.random.default_rng(seed).permutation(len(points_obj))
     _, rvec, tvec, _ = cv2.solvePnPRansac(
         points_obj[order], px[order], K, None, iterationsCount=400, reprojectionError=8.0, confidence=0.999,

@@ -1,4 +1,4 @@
-"""The store's bytes per second against numpy's memory map, on a bank of layer 2 at SD 1.5's size."""
+"""Bytes per second of the store compared with numpy's memmap, on the layer 2 maps of 300 templates at SD 1.5's size."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.inputs import SD15, TEMPLATES
-from benchmarks.measure import Figure, interleaved
+from benchmarks.measure import Measurement, time_interleaved
 from pipeline.store import Layout, LocalStoreConfig, Ref, Store, make_ref
 
 _BATCH = 8
 
 
-def storing(*, device: str, repeats: int) -> list[Figure]:
-    """GB/s of writing and reading 300 templates (49 MB), milliseconds of one template; files are in the page cache."""
+def storing(*, device: str, repeats: int) -> list[Measurement]:
+    """GB/s of writing and reading 300 templates (49 MB), milliseconds for one template; from the page cache."""
     channels, cells = SD15[2]
     maps = np.random.default_rng(0).standard_normal((TEMPLATES, channels, cells, cells), dtype=np.float32)
     bank = maps.astype(np.float16)
@@ -39,7 +39,7 @@ def storing(*, device: str, repeats: int) -> list[Figure]:
         np.save(path, bank)
         warm = store.read(ref)
         warm.array("maps", [0])
-        took = interleaved(
+        times = time_interleaved(
             {
                 "write": write,
                 "write memmap": write_mapped,
@@ -50,12 +50,12 @@ def storing(*, device: str, repeats: int) -> list[Figure]:
             },
             repeats=repeats,
         )
-    speed = {name: bank.nbytes / 1e9 / times.cpu_s for name, times in took.items()}
+    speed = {name: bank.nbytes / 1e9 / t.cpu_s for name, t in times.items()}
     return [
-        Figure("bank of layer 2, loaded", speed["read"], "GB/s of one core", "", 1.0, "more"),
-        Figure("bank of layer 2, loaded", speed["read"] / speed["read memmap"], "x", "numpy.memmap"),
-        Figure("bank of layer 2, written", speed["write"], "GB/s of one core"),
-        Figure("bank of layer 2, written", speed["write"] / speed["write memmap"], "x", "numpy.memmap"),
-        Figure("one template of layer 2, entry opened for it", 1e3 * took["row"].cpu_s, "ms of one core"),
-        Figure("one template of layer 2, entry open", 1e3 * took["row again"].cpu_s, "ms of one core"),
+        Measurement("layer 2 of 300 templates, read", speed["read"], "GB/s of one core", "", 1.0, "more"),
+        Measurement("layer 2 of 300 templates, read", speed["read"] / speed["read memmap"], "x", "numpy.memmap"),
+        Measurement("layer 2 of 300 templates, written", speed["write"], "GB/s of one core"),
+        Measurement("layer 2 of 300 templates, written", speed["write"] / speed["write memmap"], "x", "numpy.memmap"),
+        Measurement("layer 2 of one template, opening the entry", 1e3 * times["row"].cpu_s, "ms of one core"),
+        Measurement("layer 2 of one template, entry already open", 1e3 * times["row again"].cpu_s, "ms of one core"),
     ]

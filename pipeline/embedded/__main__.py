@@ -26,29 +26,15 @@ _FIRST_SHARDS = 8
 def main() -> None:
     """Parse the options and train."""
     parser = argparse.ArgumentParser(prog="python -m pipeline.embedded", description=__doc__)
-    parser.add_argument(
-        "--folder",
-        type=Path,
-        default=Path("cache/embedded"),
-        help="for shards, checkpoints and loss curves (%(default)s)",
-    )
-    parser.add_argument("--minutes", type=_above_zero, default=120.0, help="stop after this time (%(default)g)")
-    parser.add_argument("--scale", type=_above_zero, default=1.0, help="factor on the number of steps (%(default)g)")
-    parser.add_argument(
-        "--batch",
-        type=_above_zero,
-        default=1.0,
-        help="factor on the batch size; use less on a slow machine (%(default)g)",
-    )
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
-    parser.add_argument("--device", choices=devices, default=devices[-1], help="(%(default)s)")
-    parser.add_argument(
-        "--workers",
-        type=_count,
-        default=0,
-        help="processes that draw batches; 0: the training process does (%(default)d)",
-    )
-    parser.add_argument("--threads", type=_count, default=0, help="CPU threads of torch; 0: all cores (%(default)d)")
+    add, default = parser.add_argument, "(default: %(default)s)"
+    add("--folder", type=Path, default=Path("cache/embedded"), help=f"for shards, checkpoints, loss curves {default}")
+    add("--minutes", type=_above_zero, default=120.0, help=f"stop after this time {default}")
+    add("--scale", type=_above_zero, default=1.0, help=f"factor on the number of steps {default}")
+    add("--batch", type=_above_zero, default=1.0, help=f"factor on the batch size; less for slow machines {default}")
+    add("--device", choices=devices, default=devices[-1], help=f"where to train {default}")
+    add("--workers", type=_count, default=0, help=f"processes that draw batches; 0: no extra processes {default}")
+    add("--threads", type=_count, default=0, help=f"CPU threads of torch; 0: all cores {default}")
     run(parser.parse_args())
 
 
