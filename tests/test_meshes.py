@@ -82,7 +82,7 @@ def glb(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("write", [ply_with_vertex_uv, ply_with_corner_uv, obj_with_mtl, glb])
-def test_every_format_puts_the_same_texel_on_the_same_corner(write, tmp_path):
+def test_every_format_maps_the_same_texel_to_the_same_corner(write, tmp_path):
     mesh = read_mesh(write(tmp_path))
     for corner, quarter in zip(SQUARE, CORNER_QUARTER, strict=True):
         at = np.flatnonzero((mesh.vertices == corner).all(axis=1))
@@ -91,7 +91,7 @@ def test_every_format_puts_the_same_texel_on_the_same_corner(write, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".gltf", ".stl", ".off"])
-def test_every_format_gives_the_same_surface_in_unchanged_numbers(suffix, tmp_path):
+def test_every_format_gives_the_same_surface(suffix, tmp_path):
     box = trimesh.creation.box((10, 20, 30))
     if suffix == ".gltf":
         for name, data in trimesh.exchange.gltf.export_gltf(box).items():
@@ -106,7 +106,7 @@ def test_every_format_gives_the_same_surface_in_unchanged_numbers(suffix, tmp_pa
     assert diameter_mm(mesh) == pytest.approx(1400**0.5)
 
 
-def test_vertices_of_the_file_come_first_and_copies_at_seams_after_them(tmp_path):
+def test_vertices_keep_their_order_and_copies_follow(tmp_path):
     write_texture(tmp_path)
     own = np.array([[[0, 0], [1, 0], [1, 1]], [[0.5, 0], [0.5, 1], [0, 1]]])  # corners 0 and 2 differ between faces
     faces = [[3, *face, 6, *uv.reshape(-1)] for face, uv in zip(SQUARE_FACES, own, strict=True)]
@@ -121,7 +121,7 @@ def test_vertices_of_the_file_come_first_and_copies_at_seams_after_them(tmp_path
     np.testing.assert_array_equal(mesh.uv[mesh.faces], own)
 
 
-def test_a_seam_of_an_obj_keeps_the_coordinates_of_both_sides(tmp_path):
+def test_seam_of_an_obj_keeps_both_texture_coordinates(tmp_path):
     path = obj_with_mtl(tmp_path)
     lines = path.read_text().replace("f 1/1 3/3 4/4", "vt 0.5 0.4\nvt 0.3 0.2\nf 1/5 3/6 4/4").splitlines()
     path.write_text("\n".join(lines))
@@ -132,7 +132,7 @@ def test_a_seam_of_an_obj_keeps_the_coordinates_of_both_sides(tmp_path):
     assert {tuple(row) for row in corners.reshape(-1, 5)} == {tuple(row) for row in wanted.reshape(-1, 5)}
 
 
-def test_digest_follows_bytes_not_places(tmp_path):
+def test_digest_depends_on_contents_not_locations(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
         folder.mkdir()
@@ -146,13 +146,13 @@ def test_digest_follows_bytes_not_places(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl"])
-def test_a_digest_alone_is_that_of_the_mesh(suffix, tmp_path):
+def test_mesh_digest_equals_that_of_the_mesh_read(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
     trimesh.Trimesh(SQUARE, SQUARE_FACES, process=False).export(path)
     assert mesh_digest(path) == read_mesh(path).digest
 
 
-def test_the_digest_of_a_ply_follows_its_texture_and_parses_nothing(tmp_path, monkeypatch):
+def test_digest_of_a_ply_includes_its_texture_without_parsing(tmp_path, monkeypatch):
     path = ply_with_vertex_uv(tmp_path)
     whole = read_mesh(path).digest
     monkeypatch.setattr("pipeline.io.meshes.read_mesh", None)
@@ -164,7 +164,7 @@ def test_the_digest_of_a_ply_follows_its_texture_and_parses_nothing(tmp_path, mo
         mesh_digest(path)
 
 
-def test_binary_ply_comes_back_as_written(tmp_path):
+def test_binary_ply_round_trip(tmp_path):
     rng = np.random.default_rng(0)
     vertices = rng.normal(size=(50, 3)).astype(np.float32).astype(float) * 64
     mesh = Mesh(vertices, rng.integers(0, 50, (80, 3)), colours=rng.integers(0, 256, (50, 3)).astype(np.uint8))
@@ -187,7 +187,7 @@ def test_quads_and_triangles_may_mix(tmp_path):
     assert areas.sum() / 2 == 200
 
 
-def test_colours_of_faces_stay_sharp(tmp_path):
+def test_face_colours_stay_sharp(tmp_path):
     extra = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     (tmp_path / "f.ply").write_text(
         ascii_ply(SQUARE, [[3, 0, 1, 2, 255, 0, 0], [3, 0, 2, 3, 0, 0, 255]], face_extra=extra)
@@ -204,7 +204,7 @@ def test_a_plain_mesh_has_no_colours(tmp_path):
     assert mesh.texture is None
 
 
-def test_two_textured_materials_share_an_atlas_and_a_repeat_is_written_out(tmp_path):
+def test_two_textures_share_an_atlas_with_repeats_written_out(tmp_path):
     write_texture(tmp_path)
     Image.new("RGB", (5, 3), (200, 100, 50)).save(tmp_path / "other.png")
     (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd skin.png\nnewmtl b\nmap_Kd other.png\nnewmtl c\nKd 0.2 0.4 0.6\n")
@@ -225,11 +225,11 @@ def test_two_textured_materials_share_an_atlas_and_a_repeat_is_written_out(tmp_p
     for corner, quarter in zip(SQUARE, CORNER_QUARTER, strict=True):
         for layer, colour in enumerate((QUARTERS[quarter], (200, 100, 50), (51, 102, 153))):
             seen = at(corner + layer * UP)
-            # a coordinate on a texel's centre is off by 1e-15, and 255 times that is no 8-bit step
+            # texel centres are off by 1e-15, far below one 8-bit step
             np.testing.assert_allclose(seen, np.tile(colour, (len(seen), 1)), atol=1e-3)
 
 
-def test_parts_of_a_scene_stand_where_it_places_them(tmp_path):
+def test_parts_of_a_scene_are_transformed(tmp_path):
     scene = trimesh.Scene()
     for k, colour in enumerate([(255, 0, 0, 255), (0, 255, 0, 255)]):
         ball = trimesh.creation.icosphere(subdivisions=1, radius=5)
@@ -244,7 +244,7 @@ def test_parts_of_a_scene_stand_where_it_places_them(tmp_path):
 
 
 @pytest.mark.parametrize("points", ["cloud", "sphere", "flat", "line"])
-def test_diameter_is_the_largest_of_all_distances(points):
+def test_diameter_equals_the_largest_pairwise_distance(points):
     rng = np.random.default_rng(1)
     cloud = rng.normal(size=(200, 3)) * [3, 1, 0.5] + 1000
     vertices = {
@@ -254,11 +254,11 @@ def test_diameter_is_the_largest_of_all_distances(points):
         "line": cloud * [1, 0, 0],
     }[points]
     brute = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1).max()
-    # two ways of summing three squares
+    # different order of summation
     assert diameter_mm(Mesh(vertices, np.array([[0, 1, 2]]))) == pytest.approx(brute, rel=1e-12)
 
 
-def test_real_textured_and_coloured_meshes_are_read(bop_mini):
+def test_real_textured_and_coloured_meshes_can_be_read(bop_mini):
     mug = read_mesh(bop_mini / "ycbv" / "models" / "obj_000014.ply")
     assert mug.texture.shape == (2048, 2048, 3)
     assert len(mug.uv) == len(mug.vertices) == 10524
@@ -284,7 +284,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_ply_is_one_line_that_names_it(case, tmp_path):
+def test_broken_ply_is_reported_in_one_line(case, tmp_path):
     text, expected = BROKEN[case]
     (tmp_path / "broken.ply").write_text(text)
     with pytest.raises(BadInput, match=r"broken\.ply") as error:
@@ -295,7 +295,7 @@ def test_a_broken_ply_is_one_line_that_names_it(case, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".gltf", ".stl", ".off"])
 @pytest.mark.parametrize("content", [b"", b"\x00\xff\x13garbage" * 40])
-def test_garbage_is_refused_in_every_format(suffix, content, tmp_path, capfd):
+def test_garbage_is_rejected_in_every_format(suffix, content, tmp_path, capfd):
     (tmp_path / f"bad{suffix}").write_bytes(content)
     with pytest.raises(BadInput, match="bad") as error:
         read_mesh(tmp_path / f"bad{suffix}")
@@ -304,7 +304,7 @@ def test_garbage_is_refused_in_every_format(suffix, content, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".stl"])
-def test_a_truncated_file_is_refused_wherever_it_was_cut(suffix, tmp_path):
+def test_truncated_file_is_rejected(suffix, tmp_path):
     path = tmp_path / f"cut{suffix}"
     mesh = trimesh.creation.icosphere(subdivisions=2)
     mesh.export(path)
@@ -315,7 +315,7 @@ def test_a_truncated_file_is_refused_wherever_it_was_cut(suffix, tmp_path):
             read_mesh(path)
 
 
-def test_a_missing_mesh_and_an_unknown_suffix_are_named(tmp_path):
+def test_missing_mesh_and_unknown_suffix_are_reported(tmp_path):
     with pytest.raises(BadInput, match=r"gone\.ply: found no such file"):
         read_mesh(tmp_path / "gone.ply")
     (tmp_path / "part.step").write_text("ISO-10303-21;")
@@ -324,7 +324,7 @@ def test_a_missing_mesh_and_an_unknown_suffix_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("write", [ply_with_vertex_uv, obj_with_mtl])
-def test_a_missing_texture_is_named(write, tmp_path):
+def test_missing_texture_is_reported(write, tmp_path):
     path = write(tmp_path)
     (tmp_path / "skin.png").unlink()
     with pytest.raises(BadInput, match=rf"skin\.png: found no such file, needs the file named in {path.name}"):
@@ -332,7 +332,7 @@ def test_a_missing_texture_is_named(write, tmp_path):
 
 
 @pytest.mark.parametrize("write", [ply_with_vertex_uv, obj_with_mtl])
-def test_a_truncated_texture_is_named(write, tmp_path):
+def test_truncated_texture_is_reported(write, tmp_path):
     path = write(tmp_path)
     data = (tmp_path / "skin.png").read_bytes()
     (tmp_path / "skin.png").write_bytes(data[: len(data) // 2])
@@ -340,7 +340,7 @@ def test_a_truncated_texture_is_named(write, tmp_path):
         read_mesh(path)
 
 
-def test_a_missing_material_file_is_named(tmp_path):
+def test_missing_material_file_is_reported(tmp_path):
     path = obj_with_mtl(tmp_path)
     (tmp_path / "c.mtl").unlink()
     with pytest.raises(BadInput, match=r"c\.mtl: found no such file"):

@@ -52,8 +52,8 @@ def parse_results_name(path: Path) -> tuple[str, str, str] | None:
 
     As in BOP's tools, anything after a further underscore is ignored.
     """
-    found = re.fullmatch(r"([^_]+)_([^_-]+)-([^_]+)(?:_.*)?", path.stem)
-    return (found[1], found[2], found[3]) if found and path.suffix == ".csv" else None
+    parts = re.fullmatch(r"([^_]+)_([^_-]+)-([^_]+)(?:_.*)?", path.stem)
+    return (parts[1], parts[2], parts[3]) if parts and path.suffix == ".csv" else None
 
 
 def make_rows(

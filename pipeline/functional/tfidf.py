@@ -20,12 +20,12 @@ def nearest_words(
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
     """Squared Euclidean distances to, and indices of, each point's k <= ``count`` nearest words, nearest first."""
     count, lengths = min(count, len(words)), (words * words).sum(1)
-    found = [
+    nearest = [
         torch.topk(torch.addmm(lengths, block, words.T, alpha=-2), count, largest=False)
         for block in points.split(_BLOCK)
     ]
-    index = torch.cat([f.indices for f in found])
-    squared = torch.cat([f.values for f in found]) + (points * points).sum(1, keepdim=True)
+    index = torch.cat([block.indices for block in nearest])
+    squared = torch.cat([block.values for block in nearest]) + (points * points).sum(1, keepdim=True)
     return squared.clamp(min=0), index
 
 

@@ -30,7 +30,7 @@ def scene(root: Path) -> Path:
     return root / "test" / "000007"
 
 
-def opened(root: Path, **options: object) -> Dataset:
+def open_tiny(root: Path, **options: object) -> Dataset:
     return open_dataset(root, name="tiny", **options)
 
 
@@ -42,22 +42,22 @@ def message(call: object, *args: object, **options: object) -> str:
     return text
 
 
-def test_place_of_the_dataset_changes_nothing_that_is_read(root: Path, tmp_path: Path):
-    here = opened(root)
+def test_result_does_not_depend_on_the_datasets_location(root: Path, tmp_path: Path):
+    here = open_tiny(root)
     moved = root.rename(tmp_path / "elsewhere")
-    there = opened(moved)
+    there = open_tiny(moved)
     assert here.targets == there.targets
-    assert there.object_model(1).mesh.digest == opened(moved).object_model(1).mesh.digest
+    assert there.object_model(1).mesh.digest == open_tiny(moved).object_model(1).mesh.digest
 
 
 def test_order_of_the_targets_file_does_not_matter(root: Path):
-    before = opened(root).targets
+    before = open_tiny(root).targets
     edit_json(root / "test_targets_bop19.json", lambda targets: targets.reverse())
-    assert opened(root).targets == before
+    assert open_tiny(root).targets == before
 
 
 def test_tiny_dataset_reads_as_it_was_written(root: Path):
-    dataset = opened(root)
+    dataset = open_tiny(root)
     assert dataset.targets == (Target(7, 0, 1, 2), Target(7, 0, 2, 1), Target(7, 3, 2, 1))
     assert dataset.images == ((7, 0), (7, 3))
     assert dataset.object_ids == (1, 2)
@@ -73,11 +73,11 @@ def test_tiny_dataset_reads_as_it_was_written(root: Path):
 
 
 def test_depth_is_scaled_to_millimetres(root: Path):
-    np.testing.assert_array_equal(opened(root).depth_mm(7, 0), np.full(SIZE_HW, 400.0, np.float32))
+    np.testing.assert_array_equal(open_tiny(root).depth_mm(7, 0), np.full(SIZE_HW, 400.0, np.float32))
 
 
 def test_annotated_box_spans_the_edges_of_the_mask(root: Path):
-    dataset = opened(root)
+    dataset = open_tiny(root)
     for gt in dataset.ground_truth(7, 0):
         assert gt.bbox_visib_xyxy == mask_bbox(dataset.mask(7, 0, gt.gt_id))
     x0, y0, x1, y1 = rectangle(*POSES[0][0])
@@ -91,7 +91,7 @@ def test_grey_images_have_three_equal_channels_and_8_bits(root: Path, scene: Pat
         (scene / "rgb" / f"{im_id:06d}.png").unlink()
         Image.fromarray(values).save(scene / "gray" / name)
     for im_id in (0, 3):
-        rgb = opened(root).image(7, im_id).rgb
+        rgb = open_tiny(root).image(7, im_id).rgb
         assert rgb.dtype == np.uint8
         assert (rgb == rgb[..., :1]).all()
         assert np.abs(rgb[..., 0] - ramp / 257).max() <= 1  # rounding of 16 to 8 bit
@@ -99,7 +99,7 @@ def test_grey_images_have_three_equal_channels_and_8_bits(root: Path, scene: Pat
 
 @pytest.mark.parametrize("kind", ["JPEG", "WEBP", "TIFF"])
 @pytest.mark.parametrize("orientation", [None, *range(1, 9), 77])
-def test_photographs_are_read_upright_as_opencv_reads_them(tmp_path: Path, kind: str, orientation: int | None):
+def test_images_are_rotated_upright_as_in_opencv(tmp_path: Path, kind: str, orientation: int | None):
     rgb = np.zeros((40, 64, 3), np.uint8)
     rgb[:20, :32], rgb[:20, 32:], rgb[20:, :32] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
     exif = Image.Exif()
@@ -109,7 +109,7 @@ def test_photographs_are_read_upright_as_opencv_reads_them(tmp_path: Path, kind:
     Image.fromarray(rgb).save(path, kind, exif=exif, **({} if kind == "TIFF" else {"quality": 95}))
     read = read_rgb(path)
     assert image_size(path) == read.shape[:2]
-    if kind == "JPEG":  # of others OpenCV reads no orientation, or nothing at all
+    if kind == "JPEG":  # OpenCV ignores the orientation of other formats or cannot read them
         seen = cv2.imread(str(path))[..., ::-1]
         assert read.shape == seen.shape
         assert np.abs(read.astype(int) - seen).mean() < 3
@@ -121,17 +121,17 @@ def test_photographs_are_read_upright_as_opencv_reads_them(tmp_path: Path, kind:
     assert read_mask(path).shape == read.shape[:2]
 
 
-def test_without_a_targets_file_every_annotated_instance_is_asked_for(root: Path):
-    asked = opened(root).targets
+def test_without_a_targets_file_every_annotated_instance_is_a_target(root: Path):
+    asked = open_tiny(root).targets
     (root / "test_targets_bop19.json").unlink()
-    assert opened(root).targets == asked
-    assert opened(root, targets=None).targets == asked
+    assert open_tiny(root).targets == asked
+    assert open_tiny(root, targets=None).targets == asked
 
 
-def test_opening_reads_no_pixel(root: Path, scene: Path):
+def test_opening_a_dataset_reads_no_pixels(root: Path, scene: Path):
     path = scene / "rgb" / "000000.png"
-    path.write_bytes(path.read_bytes()[:200])  # header whole, pixels gone
-    dataset = opened(root)
+    path.write_bytes(path.read_bytes()[:200])  # complete header, no pixels
+    dataset = open_tiny(root)
     assert "broken image" in message(dataset.image, 7, 0)
     assert str(path) in message(dataset.image, 7, 0)
 
@@ -139,15 +139,15 @@ def test_opening_reads_no_pixel(root: Path, scene: Path):
 def test_diameter_comes_from_the_mesh_without_models_info(root: Path):
     (root / "models" / "models_info.json").unlink()
     # float32 in the ply is exact for these lengths
-    assert opened(root).object_model(2).diameter_mm == pytest.approx(2 * np.linalg.norm(HALF_MM[2]), rel=1e-9)
+    assert open_tiny(root).object_model(2).diameter_mm == pytest.approx(2 * np.linalg.norm(HALF_MM[2]), rel=1e-9)
 
 
 def test_models_folder_is_chosen_by_argument(root: Path):
     (root / "models").rename(root / "models_cad")
-    text = message(opened, root)
+    text = message(open_tiny, root)
     assert str(root / "models") in text
     assert "models_cad" in text
-    assert opened(root, models="models_cad").object_model(1).obj_id == 1
+    assert open_tiny(root, models="models_cad").object_model(1).obj_id == 1
 
 
 def test_camera_of_a_crop_is_accepted():
@@ -198,9 +198,9 @@ def test_camera_of_a_crop_is_accepted():
         ("scene_gt_info.json", lambda c: c["3"][0].update(visib_fract=None), ["image 3", "visib_fract", "null"]),
     ],
 )
-def test_fault_in_a_scene_is_one_line_that_names_its_place(root: Path, scene: Path, file: str, edit, parts: list[str]):
+def test_fault_in_a_scene_is_reported_with_its_location(root: Path, scene: Path, file: str, edit, parts: list[str]):
     edit_json(scene / file, edit)
-    text = message(opened, root)
+    text = message(open_tiny, root)
     assert str(scene / file) in text
     for part in parts:
         assert re.search(part, text), f"{part!r} in {text!r}"
@@ -219,60 +219,60 @@ def test_fault_in_a_scene_is_one_line_that_names_its_place(root: Path, scene: Pa
         (lambda t: t.clear(), ["list of targets"]),
     ],
 )
-def test_fault_in_the_targets_is_one_line_that_names_its_place(root: Path, edit, parts: list[str]):
+def test_fault_in_the_targets_is_reported_with_its_location(root: Path, edit, parts: list[str]):
     edit_json(root / "test_targets_bop19.json", edit)
-    text = message(opened, root)
+    text = message(open_tiny, root)
     for part in parts:
         assert part in text
 
 
-def test_target_whose_image_file_is_missing(root: Path, scene: Path):
+def test_missing_image_of_a_target_is_reported(root: Path, scene: Path):
     (scene / "rgb" / "000003.png").unlink()
-    text = message(opened, root)
+    text = message(open_tiny, root)
     assert "scene 7, image 3" in text
     assert "rgb/000003.png" in text
 
 
-def test_invalid_json_names_its_line(root: Path, scene: Path):
+def test_invalid_json_is_reported_with_its_line(root: Path, scene: Path):
     (scene / "scene_camera.json").write_text('{"0": {\n"cam_K": [1,,2]}}')
-    text = message(opened, root)
+    text = message(open_tiny, root)
     assert str(scene / "scene_camera.json") in text
     assert "line 2" in text
 
 
 @pytest.mark.parametrize(("field", "value"), [("root", "absent"), ("split", "train"), ("models", "meshes")])
-def test_missing_folder_is_named(root: Path, field: str, value: str):
+def test_missing_folder_is_reported(root: Path, field: str, value: str):
     config = {"name": "tiny", "root": str(root), "split": "test", "models": "models"} | {field: value}
     text = message(DatasetConfig(**config).open)
     assert value in text
     assert "no such folder" in text
 
 
-def test_object_without_an_entry_in_models_info(root: Path):
+def test_object_missing_in_models_info_is_reported(root: Path):
     edit_json(root / "models" / "models_info.json", lambda info: info.pop("2"))
-    text = message(opened, root)
+    text = message(open_tiny, root)
     assert "models_info.json, object 2" in text
     assert "entries for 1" in text
 
 
-def test_mesh_in_metres_is_noticed_with_and_without_models_info(root: Path):
+def test_mesh_in_metres_is_detected_with_and_without_models_info(root: Path):
     write_box_ply(root / "models" / "obj_000001.ply", tuple(h / 1000 for h in HALF_MM[1]))
-    text = message(opened(root).object_model, 1)
+    text = message(open_tiny(root).object_model, 1)
     assert "obj_000001.ply" in text
     assert "metres" in text
     (root / "models" / "models_info.json").unlink()
-    text = message(opened(root).object_model, 1)
+    text = message(open_tiny(root).object_model, 1)
     assert "obj_000001.ply" in text
     assert "metres" in text
 
 
-def test_translations_in_metres_are_noticed(root: Path, scene: Path):
+def test_translations_in_metres_are_detected(root: Path, scene: Path):
     edit_json(
         scene / "scene_gt.json",
         lambda c: [g.update(cam_t_m2c=[v / 1000 for v in g["cam_t_m2c"]]) for i in c for g in c[i]],
     )
     (scene / "scene_gt_info.json").unlink()
-    assert "cam_t_m2c looks like metres" in message(opened(root).object_model, 2)
+    assert "cam_t_m2c looks like metres" in message(open_tiny(root).object_model, 2)
 
 
 @pytest.mark.parametrize(
@@ -292,20 +292,20 @@ def test_translations_in_metres_are_noticed(root: Path, scene: Path):
         (lambda i: i["1"].update(symmetries_continuous=[{"axis": [0, 0, 1]}]), ["object 1", "offset"]),
     ],
 )
-def test_fault_in_models_info_is_one_line_that_names_its_place(root: Path, edit, parts: list[str]):
+def test_fault_in_models_info_is_reported_with_its_location(root: Path, edit, parts: list[str]):
     edit_json(root / "models" / "models_info.json", edit)
-    text = message(opened, root)
+    text = message(open_tiny, root)
     for part in ["models_info.json", *parts]:
         assert part in text
 
 
-def test_symmetries_are_counted_as_bop_toolkit_counts_them(bop_reference: Path, root: Path):
+def test_number_of_symmetries_equals_bop_toolkits(bop_reference: Path, root: Path):
     for path in (bop_reference / "models").iterdir():
         (root / "models" / path.name).write_bytes(path.read_bytes())
     names = ("scene_id", "im_id", "obj_id", "inst_count")
     write_json(root / "test_targets_bop19.json", [dict(zip(names, (7, 0, o, 1), strict=True)) for o in (1, 2, 3)])
     (root / "test" / "000007" / "scene_gt.json").unlink()
-    dataset = opened(root)
+    dataset = open_tiny(root)
     counts = json.loads((bop_reference / "pose_errors.json").read_text())["symmetry_count"]
     for obj_id, count in counts.items():
         symmetries = dataset.object_model(int(obj_id)).symmetries
@@ -313,7 +313,7 @@ def test_symmetries_are_counted_as_bop_toolkit_counts_them(bop_reference: Path, 
         np.testing.assert_array_equal(symmetries[0], np.eye(4))
 
 
-def test_lmo_photographs_read_whole(bop_mini: Path):
+def test_lmo_images_can_be_read(bop_mini: Path):
     dataset = open_dataset(bop_mini / "lmo", name="lmo")
     assert len(dataset.targets) == 285
     assert len(dataset.images) == 40
@@ -321,12 +321,12 @@ def test_lmo_photographs_read_whole(bop_mini: Path):
     scene_id, im_id = dataset.images[0]
     assert dataset.image(scene_id, im_id).rgb.shape == (480, 640, 3)
     assert [len(dataset.object_model(o).symmetries) for o in dataset.object_ids] == [1, 1, 1, 1, 1, 2, 2, 1]
-    # the published rotation is kept, although it is not orthonormal to better than this
+    # the published rotation is kept, although it is only orthonormal to this tolerance
     R = dataset.ground_truth(scene_id, im_id)[0].T_cam_obj[:3, :3]
     assert 1e-9 < np.abs(R @ R.T - np.eye(3)).max() < 2e-2
 
 
-def test_ycbv_photographs_read_whole(bop_mini: Path):
+def test_ycbv_images_can_be_read(bop_mini: Path):
     dataset = open_dataset(bop_mini / "ycbv", name="ycbv")
     assert len(dataset.targets) == 6
     assert dataset.depth_mm(100, 1).max() > 500
@@ -337,7 +337,7 @@ def test_ycbv_photographs_read_whole(bop_mini: Path):
 
 
 @pytest.mark.parametrize("resize", [0.5, 2.0])
-def test_real_images_of_another_size_than_their_camera_are_noticed(bop_mini: Path, tmp_path: Path, resize: float):
+def test_camera_of_another_image_size_is_detected_on_real_images(bop_mini: Path, tmp_path: Path, resize: float):
     for dataset in ("lmo", "ycbv"):
         bop = tmp_path / f"{dataset}{resize}"
         scene = next((bop_mini / dataset / "test").iterdir())
@@ -347,7 +347,7 @@ def test_real_images_of_another_size_than_their_camera_are_noticed(bop_mini: Pat
             (copy / path.name).write_bytes(path.read_bytes())
         (bop / "models").symlink_to(bop_mini / dataset / "models")
         edit_json(
-            copy / "scene_camera.json", lambda c: [v.update(cam_K=scaled(v["cam_K"], resize)) for v in c.values()]
+            copy / "scene_camera.json", lambda c: [v.update(cam_K=scale_K(v["cam_K"], resize)) for v in c.values()]
         )
         (copy / "rgb").rmdir()
         (copy / "rgb").symlink_to(scene / "rgb")
@@ -355,12 +355,12 @@ def test_real_images_of_another_size_than_their_camera_are_noticed(bop_mini: Pat
         assert "cam_K" in message(open_dataset, bop, name=dataset)
 
 
-def scaled(K_list: list[float], factor: float) -> list[float]:
+def scale_K(K_list: list[float], factor: float) -> list[float]:
     return [v * factor for v in K_list[:8]] + [1.0]
 
 
 @pytest.mark.parametrize("name", ["lmo", "ycbv", "tless", "bop"])
-def test_dataset_yaml_lists_every_field_and_builds(name: str):
+def test_dataset_yaml_lists_every_field_and_can_be_instantiated(name: str):
     values = yaml.safe_load((CONF / "dataset" / f"{name}.yaml").read_text())["dataset"]
     assert values.pop("_target_") == "pipeline.bop.dataset.DatasetConfig"
     config = build(DatasetConfig, values, where="dataset")
@@ -368,7 +368,7 @@ def test_dataset_yaml_lists_every_field_and_builds(name: str):
     assert config.name == (name if name != "bop" else "???")
 
 
-def test_unknown_dataset_field_is_one_line():
+def test_unknown_dataset_field_is_reported_in_one_line():
     assert "dataset.modells" in message(
         build, DatasetConfig, {"name": "a", "root": "b", "modells": "c"}, where="dataset"
     )

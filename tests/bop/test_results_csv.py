@@ -34,7 +34,7 @@ def test_rows_read_back_bit_for_bit(tmp_path: Path):
         np.testing.assert_array_equal(row.T_cam_obj, back.T_cam_obj)
 
 
-def test_file_is_what_bop_asks_for(tmp_path: Path):
+def test_file_has_bops_format(tmp_path: Path):
     T = rigid(np.eye(3), np.array([1.5, -2.0, 700.0]))
     write_results(tmp_path / "deep" / "r.csv", [ResultRow(1, 2, 3, 0.5, T, 0.25)])
     text = (tmp_path / "deep" / "r.csv").read_bytes().decode("ascii")
@@ -53,7 +53,7 @@ def test_rows_of_one_image_share_its_time_and_are_sorted():
     ]
 
 
-def test_no_rows_give_a_file_with_a_header_alone(tmp_path: Path):
+def test_without_rows_the_file_has_only_a_header(tmp_path: Path):
     write_results(tmp_path / "r.csv", [])
     assert (tmp_path / "r.csv").read_text() == HEADER + "\n"
     assert read_results(tmp_path / "r.csv") == []
@@ -90,7 +90,7 @@ def test_rotations_rounded_to_three_decimals_are_read(tmp_path: Path):
         ([HEADER, LINE, LINE.replace("0.25", "0.5")], ["line 3", "field time", "0.5 after 0.25", "image 2"]),
     ],
 )
-def test_fault_in_a_csv_names_line_and_field(tmp_path: Path, lines: list[str], parts: list[str]):
+def test_fault_in_a_csv_is_reported_with_line_and_field(tmp_path: Path, lines: list[str], parts: list[str]):
     path = tmp_path / "r.csv"
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(BadInput) as raised:
@@ -99,12 +99,12 @@ def test_fault_in_a_csv_names_line_and_field(tmp_path: Path, lines: list[str], p
         assert part in str(raised.value)
 
 
-def test_missing_csv_is_one_line(tmp_path: Path):
+def test_missing_csv_is_reported_in_one_line(tmp_path: Path):
     with pytest.raises(BadInput, match=r"absent\.csv"):
         read_results(tmp_path / "absent.csv")
 
 
-def test_name_of_the_file_follows_bop():
+def test_file_name_follows_bop():
     assert results_name("dzop", "lmo") == "dzop_lmo-test.csv"
     assert results_name("dzop-x", "tless", "test_primesense") == "dzop-x_tless-test.csv"
 

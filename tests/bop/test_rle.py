@@ -9,7 +9,7 @@ from pycocotools import mask as coco
 from pipeline.bop.masks import decode_rle, encode_rle, read_rle, rle_area, to_uncompressed
 
 
-def uncompressed(mask: np.ndarray) -> list[int]:
+def encode_by_loop(mask: np.ndarray) -> list[int]:
     """Column-major runs, background first, written as a plain loop."""
     runs, value = [0], False
     for pixel in mask.T.ravel():
@@ -22,10 +22,10 @@ def uncompressed(mask: np.ndarray) -> list[int]:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**81 - 1))
-def test_every_way_to_write_a_mask_reads_the_same(h: int, w: int, bits: int):
+def test_compressed_and_uncompressed_rle_decode_to_the_same_mask(h: int, w: int, bits: int):
     mask = np.array([bits >> i & 1 for i in range(h * w)], dtype=bool).reshape(h, w)
     compressed = encode_rle(mask)
-    as_list = {"size": [h, w], "counts": uncompressed(mask)}
+    as_list = {"size": [h, w], "counts": encode_by_loop(mask)}
     padded = {"size": [h, w], "counts": [*as_list["counts"], 0, 0]}
     for given_rle in (compressed, as_list, padded):
         assert read_rle(given_rle, (h, w)) == compressed
@@ -40,7 +40,7 @@ def test_long_runs_survive_compression():
     assert read_rle(encode_rle(mask), (480, 640)) == encode_rle(mask)
 
 
-def test_masks_of_the_reference_library_read_the_same():
+def test_rle_of_pycocotools_decodes_to_the_same_mask():
     mask = np.random.default_rng(0).random((48, 64)) > 0.7
     rle = coco.encode(np.asfortranarray(mask, dtype=np.uint8))
     read = read_rle({"size": [48, 64], "counts": rle["counts"].decode()}, (48, 64))

@@ -4,8 +4,8 @@ import torch
 from pipeline.functional.binning import bin_count, log_bin
 
 
-def by_loops(maps: torch.Tensor, hierarchy: int) -> torch.Tensor:
-    """One cell, bin and neighbour after the other."""
+def bin_by_loops(maps: torch.Tensor, hierarchy: int) -> torch.Tensor:
+    """The same by nested loops over cells, bins and neighbours."""
     n, _, h, w = maps.shape
     cells = []
     for y in range(h):
@@ -32,7 +32,7 @@ def test_bins_equal_a_direct_loop(hierarchy: int, size: tuple[int, int]):
     binned = log_bin(maps, hierarchy=hierarchy)
     assert binned.shape == (2, 3 * bin_count(hierarchy), *size)
     # means of at most 81 float32 values, summed in another order
-    torch.testing.assert_close(binned, by_loops(maps, hierarchy), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(binned, bin_by_loops(maps, hierarchy), rtol=1e-5, atol=1e-6)
 
 
 def test_the_fifth_bin_is_the_cell_itself():
@@ -40,10 +40,10 @@ def test_the_fifth_bin_is_the_cell_itself():
     assert torch.equal(log_bin(maps, hierarchy=2)[:, 8:10], maps)
 
 
-def test_the_same_everywhere_stays_the_same():
+def test_constant_map_stays_constant():
     torch.testing.assert_close(log_bin(torch.full((1, 1, 4, 6), 3.0), hierarchy=2), torch.full((1, 17, 4, 6), 3.0))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_binned_too(dtype: torch.dtype):
+def test_half_precision_is_supported(dtype: torch.dtype):
     assert log_bin(torch.randn(1, 2, 4, 4).to(dtype), hierarchy=2).dtype == dtype

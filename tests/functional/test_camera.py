@@ -13,7 +13,7 @@ def _points(count: int = 50) -> np.ndarray:
     return np.random.default_rng(0).uniform((80, -110, 400), (180, -50, 500), (count, 3))
 
 
-def test_pixels_move_as_homogeneous_points_and_an_affine_map_divides_by_nothing():
+def test_homography_equals_homogeneous_coordinates_and_is_exact_if_affine():
     px = np.random.default_rng(1).uniform(0, 600, (20, 2))
     A = virtual_crop(BOX, K, size=128, padding_ratio=1.2)
     homogeneous = np.concatenate([px, np.ones((20, 1))], axis=1) @ A.T
@@ -23,7 +23,7 @@ def test_pixels_move_as_homogeneous_points_and_an_affine_map_divides_by_nothing(
     np.testing.assert_allclose(apply_homography(np.linalg.inv(A), apply_homography(A, px)), px, atol=1e-7)
 
 
-def test_points_projected_through_the_virtual_camera_are_their_pixels_moved_to_the_crop():
+def test_projection_by_the_virtual_camera_equals_the_crop_of_the_projection():
     A = virtual_crop(BOX, K, size=128, padding_ratio=1.2)
     K_crop, R_crop_cam = crop_camera(A, K)
     points = _points()
@@ -35,16 +35,16 @@ def test_points_projected_through_the_virtual_camera_are_their_pixels_moved_to_t
     np.testing.assert_allclose(K_crop, [[K_crop[0, 0], 0, 63.5], [0, K_crop[0, 0], 63.5], [0, 0, 1]], atol=1e-9)
 
 
-def test_the_padded_box_fills_the_virtual_crop_and_its_centre_is_the_crops():
+def test_padded_box_fills_the_virtual_crop_and_is_centred():
     A = virtual_crop(BOX, K, size=128, padding_ratio=1.25)
     np.testing.assert_allclose(apply_homography(A, np.array([560.5, 60.5])), [63.5, 63.5], atol=1e-9)
     corners = np.array([[x, y] for x in (510.5, 610.5) for y in (10.5, 110.5)])  # 1.25 times 80 px
     at = np.abs(apply_homography(A, corners) - 63.5)
     assert at.max() == pytest.approx(64)
-    assert at.min() > 50  # seen from 27 degrees aside, the square is a trapezoid
+    assert at.min() > 50  # 27 degrees off the axis, the square is a trapezoid
 
 
-def test_a_box_on_the_optical_axis_of_square_pixels_is_cropped_as_without_a_virtual_camera():
+def test_virtual_crop_equals_square_crop_on_the_optical_axis():
     straight = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]])
     box = (299.5, 209.5, 339.5, 269.5)
     virtual, square = (
@@ -54,12 +54,12 @@ def test_a_box_on_the_optical_axis_of_square_pixels_is_cropped_as_without_a_virt
     np.testing.assert_allclose(virtual, square, atol=1e-9)
 
 
-def test_a_crop_that_scales_and_shifts_is_a_camera_that_has_not_turned():
+def test_crop_that_scales_and_shifts_has_no_rotation():
     A = square_crop(BOX, size=128, padding_ratio=1.2)
     K_crop, R_crop_cam = crop_camera(A, K)
     np.testing.assert_allclose(K_crop, A @ K, rtol=1e-14)
     assert np.array_equal(R_crop_cam, np.eye(3))
-    for scale in (-3.0, 1e-4):  # a homography has no scale, nor has it a sign
+    for scale in (-3.0, 1e-4):  # scale and sign of a homography are arbitrary
         again = crop_camera(scale * virtual_crop(BOX, K, size=128, padding_ratio=1.2), K)
         first = crop_camera(virtual_crop(BOX, K, size=128, padding_ratio=1.2), K)
         for a, b in zip(again, first, strict=True):
@@ -67,7 +67,7 @@ def test_a_crop_that_scales_and_shifts_is_a_camera_that_has_not_turned():
         assert np.linalg.det(again[1]) == pytest.approx(1)
 
 
-def test_local_zoom_is_what_a_small_square_grows_by():
+def test_local_zoom_equals_the_growth_of_a_small_square():
     A, px, step = virtual_crop(BOX, K, size=128, padding_ratio=1.2), np.array([[530.0, 40.0], [590.0, 80.0]]), 1e-4
     dx, dy = ((apply_homography(A, px + d) - apply_homography(A, px - d)) / (2 * step) for d in ((step, 0), (0, step)))
     area = np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
@@ -75,33 +75,33 @@ def test_local_zoom_is_what_a_small_square_grows_by():
     assert local_zoom(3.0 * square_crop(BOX, size=128, padding_ratio=1.0), px) == pytest.approx(128 / 80)
 
 
-def test_a_box_around_a_right_angle_is_refused():
+def test_box_of_90_degrees_is_rejected():
     with pytest.raises(ValueError, match="90 degrees or more from its centre"):
         virtual_crop((5e5, 5e5, 9e6, 9e6), K, size=64, padding_ratio=1.2)
 
 
 @pytest.mark.parametrize("side", [20.0, 40.0, 70.0, 200.0])
-def test_a_warped_ramp_keeps_its_values_at_the_crops_pixel_centres(side):
+def test_warped_ramp_keeps_its_values_at_pixel_centres(side):
     ramp = np.add.outer(0.5 * np.arange(480), 0.25 * np.arange(640)).astype(np.float32)
     A = virtual_crop((400.0, 100.0, 400.0 + side, 100.0 + side), K, size=40, padding_ratio=1.0)
     grid = np.stack(np.meshgrid(np.arange(40), np.arange(40)), -1).astype(float)
     px = apply_homography(np.linalg.inv(A), grid)
     expected = 0.5 * px[..., 1] + 0.25 * px[..., 0]
-    # shrunk: samples spread over a pixel of a map that is no more affine there
+    # shrunk: averages samples over a pixel, inside which the map is not affine
     assert np.abs(warp(ramp, A, size=40) - expected).max() < 5e-3
 
 
-def test_warp_agrees_with_resample_where_there_is_no_perspective():
+def test_warp_equals_resample_without_perspective():
     image = np.random.default_rng(0).random((50, 60, 3)).astype(np.float32)
     larger = square_crop((20.2, 10.7, 35.2, 25.7), size=32, padding_ratio=1.1)
     assert np.allclose(warp(image, larger, size=32), resample(image, larger, size=32), atol=1e-5)  # float32
     assert np.array_equal(warp(image[:, :50], np.eye(3), size=50), image[:, :50])
     smooth = np.add.outer(np.sin(np.arange(90) / 9), np.cos(np.arange(90) / 7)).astype(np.float32)
     smaller = square_crop((8.0, 8.0, 80.0, 80.0), size=24, padding_ratio=1.0)
-    assert np.abs(warp(smooth, smaller, size=24) - resample(smooth, smaller, size=24)).max() < 0.02  # it is softer
+    assert np.abs(warp(smooth, smaller, size=24) - resample(smooth, smaller, size=24)).max() < 0.02  # warp is softer
 
 
-def test_a_warp_is_zero_outside_the_image_and_shifts_nothing():
+def test_warp_is_zero_outside_the_image_and_has_no_offset():
     image = np.ones((10, 10), np.float32)
     A = square_crop((-5.5, -5.5, 4.5, 4.5), size=10, padding_ratio=1.0)
     assert np.array_equal(warp(image, A, size=10) > 0, np.pad(np.ones((5, 5), bool), ((5, 0), (5, 0))))

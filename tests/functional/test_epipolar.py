@@ -6,7 +6,7 @@ from pipeline.functional.epipolar import epipolar_inliers
 
 
 def _two_views(depth_range: float, n: int = 120, turn: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
-    """Points seen from two sides, in cells of a map of 64."""
+    """Projections of random points in two views, in cells of a 64 x 64 map."""
     points = np.random.default_rng(0).uniform(-1, 1, (n, 3)) * [1, 1, depth_range]
     views = []
     for angle in (0.0, turn):
@@ -15,16 +15,16 @@ def _two_views(depth_range: float, n: int = 120, turn: float = 0.4) -> tuple[np.
     return views[0], views[1]
 
 
-def test_pairs_off_their_epipolar_lines_are_dropped_and_the_rest_kept():
+def test_outliers_are_dropped_and_inliers_kept():
     a, b = _two_views(depth_range=1.0)
     b[:30] = np.random.default_rng(1).uniform(5, 60, (30, 2))
     keep, reason = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0)
     assert reason == ""
-    assert keep[30:].mean() > 0.95  # a few true pairs lose to a matrix fitted to a chance inlier
-    assert keep[:30].mean() < 0.2  # a band of 2 cells in 55 holds 4 % of chance points, seven of them drawn at best
+    assert keep[30:].mean() > 0.95  # a few true pairs are lost if an outlier fits the matrix by chance
+    assert keep[:30].mean() < 0.2  # a band of 2 in 55 cells holds 4 % of random points, at most seven of them sampled
 
 
-def test_order_of_the_pairs_and_repetition_give_the_same_answer():
+def test_result_is_deterministic_and_independent_of_order():
     a, b = _two_views(depth_range=1.0)
     first, _ = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0)
     second, _ = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0)
@@ -42,7 +42,7 @@ def test_order_of_the_pairs_and_repetition_give_the_same_answer():
         (np.ones((20, 2)), np.ones((20, 2)), "points nearly on a line"),
     ],
 )
-def test_sets_without_one_fundamental_matrix_are_skipped_with_the_reason(a, b, reason):
+def test_degenerate_configurations_are_reported(a, b, reason):
     keep, said = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0)
     assert keep is None
     assert said.startswith(reason)

@@ -7,14 +7,14 @@ from pipeline.functional.featuremetric import FeatureField, RobustLoss, Surface
 from pipeline.functional.rigid import look_at, transform
 
 H, W, C = 18, 22, 5
-CELLS = np.array([[1.0, 0.0, 0.2], [0.0, 1.0, -0.1], [1e-3, -2e-3, 1.0]])  # a homography, as of a turned crop's camera
+CELLS = np.array([[1.0, 0.0, 0.2], [0.0, 1.0, -0.1], [1e-3, -2e-3, 1.0]])  # a homography, as for a rotated crop camera
 K_CELL = CELLS @ np.array([[60.0, 0, 10.5], [0, 62.0, 8.5], [0, 0, 1]])
 T = look_at(np.array([300.0, 200.0, 250.0]))
 LOSSES = pytest.mark.parametrize("alpha", [-5.0, -2.0, 0.0])
 
 
 def smooth_map(seed: int) -> np.ndarray:
-    """Waves that are far longer than a cell."""
+    """Sine waves much longer than a cell."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:H, :W]
     waves = [np.sin(a * x + b * y + c) for a, b, c in rng.uniform(-0.3, 0.3, (C, 3))]
@@ -29,7 +29,7 @@ def scene(*, normalize: bool) -> tuple[Surface, FeatureField]:
     return Surface(points, d, np.full(60, 2.0)), field
 
 
-def test_derivatives_of_a_projection_by_a_homography_are_those_of_finite_differences():
+def test_derivatives_of_a_projection_equal_finite_differences():
     points = np.random.default_rng(0).uniform(-40, 40, (20, 3))
     centre = transform(T, points).mean(0)
     _, by_xi = featuremetric.project_cells(K_CELL, transform(T, points), centre)
@@ -46,23 +46,23 @@ def test_derivatives_of_a_projection_by_a_homography_are_those_of_finite_differe
 
 @LOSSES
 @pytest.mark.parametrize("normalize", [False, True])
-def test_gradient_of_the_cost_is_that_of_finite_differences(alpha, normalize):
+def test_gradient_of_the_cost_equals_finite_differences(alpha, normalize):
     surface, field = scene(normalize=normalize)
     robust = RobustLoss(alpha, 0.7)
     _, _, gradient, centre = featuremetric.normal_equations(surface, field, K_CELL, T, robust)
     for k in range(6):
-        h = (1e-3 if k < 3 else 1e-5) * np.eye(6)[k]  # mm and radians: some 1e-4 of a cell, above float32's rounding
+        h = (1e-3 if k < 3 else 1e-5) * np.eye(6)[k]  # mm and radians: about 1e-4 cells, above float32 rounding
         ends = [
             featuremetric.normal_equations(
                 surface, field, K_CELL, featuremetric.apply_increment(T, centre, s * h), robust
             )[0]
             for s in (1, -1)
         ]
-        # a few of the points cross from one square of cells to the next, where bilinear maps have a kink
+        # a few points cross between squares of cells, where bilinear interpolation has a kink
         assert gradient[k] == pytest.approx((ends[0] - ends[1]) / (2 * h[k]), rel=0.02, abs=2e-2 * abs(gradient).max())
 
 
-def test_a_map_that_is_linear_in_place_is_read_exactly():
+def test_linear_map_is_sampled_exactly():
     y, x = np.mgrid[:H, :W].astype(np.float32)
     field = FeatureField.from_map(np.stack([x, 2 * y, x - y], axis=-1), np.ones((H, W), bool))
     xy = np.random.default_rng(0).uniform(0, (W - 1, H - 1), (50, 2))
@@ -83,10 +83,10 @@ def test_weight_is_twice_the_derivative_of_the_loss(alpha):
     assert robust.cost(np.zeros(1)) == 0
 
 
-def test_points_out_of_view_cost_what_an_unseen_point_costs_and_nothing_is_won_by_it():
+def test_points_out_of_view_have_the_unobserved_cost_and_no_gradient():
     surface, field = scene(normalize=True)
     away = T.copy()
-    for shift in ([900.0, 0, 0], [0, 0, -3000.0]):  # beside the map, behind the camera
+    for shift in ([900.0, 0, 0], [0, 0, -3000.0]):  # outside the map, behind the camera
         away[:3, 3] = T[:3, 3] + shift
         squared, seen = featuremetric.squared_residuals(surface, field, K_CELL, away)
         assert not seen.any()
@@ -100,7 +100,7 @@ def test_points_out_of_view_cost_what_an_unseen_point_costs_and_nothing_is_won_b
 
 
 @LOSSES
-def test_no_step_raises_the_cost(alpha):
+def test_no_step_increases_the_cost(alpha):
     surface, field = scene(normalize=True)
     robust, costs, pose = RobustLoss(alpha, 0.5), [], T
     for _ in range(8):
@@ -110,18 +110,18 @@ def test_no_step_raises_the_cost(alpha):
     assert costs[-1] < costs[0]
 
 
-def test_smoothing_heeds_the_foreground_alone():
+def test_smoothing_uses_only_the_foreground():
     mask = np.zeros((H, W), bool)
     mask[5:12, 6:15] = True
     features = np.where(mask[..., None], np.float32(3.0), np.float32(-100.0)) * np.ones(C, np.float32)
     for sigma in (0.0, 1.0, 2.5):
         found = featuremetric.smooth_foreground(features, mask, sigma_cells=sigma)
-        np.testing.assert_allclose(found[4:13, 5:16], 3.0, rtol=1e-5)  # and carries it over the edge
+        np.testing.assert_allclose(found[4:13, 5:16], 3.0, rtol=1e-5)  # and extends it beyond the edge
     varied = smooth_map(2)
     assert np.array_equal(featuremetric.smooth_foreground(varied, mask, sigma_cells=0.0)[mask], varied[mask])
 
 
-def test_cells_of_pixels_undo_pixels_of_cells():
+def test_cell_affine_inverts_cell_to_px():
     xy = np.random.default_rng(0).uniform(0, 60, (9, 2))
     px = camera.cell_to_px(torch.from_numpy(xy), size=420, cells=30).numpy()
     np.testing.assert_allclose(camera.apply_homography(camera.cell_affine(size=420, cells=30), px), xy, atol=1e-9)

@@ -10,7 +10,7 @@ def test_coverage_keeps_the_area_for_any_ratio_of_pixels_to_cells():
         assert torch.allclose(area, mask.float().mean((1, 2)), atol=1e-6)  # float32 sums of 2500 cells
 
 
-def test_coverage_of_whole_cells_is_the_mean_of_their_pixels():
+def test_coverage_of_aligned_cells_is_the_mean_of_their_pixels():
     mask = torch.rand(8, 8, generator=torch.Generator().manual_seed(1)) < 0.5
     expected = torch.tensor(
         [[mask[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].float().mean() for j in range(4)] for i in range(4)]
@@ -18,7 +18,7 @@ def test_coverage_of_whole_cells_is_the_mean_of_their_pixels():
     assert torch.equal(cell_coverage(mask, cells=4), expected)
 
 
-def test_cell_is_foreground_from_half_of_its_area():
+def test_cell_covered_by_half_is_foreground():
     mask = torch.zeros(4, 4, dtype=torch.bool)
     mask[0, :2] = True  # half of the upper left cell
     mask[2, 2] = True  # a quarter of the lower right one

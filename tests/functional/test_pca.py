@@ -30,7 +30,7 @@ def test_axes_do_not_depend_on_the_order_or_number_of_repeats_of_samples():
     assert torch.allclose(axes, shuffled, atol=1e-4)  # float32 Gram matrices summed in another order
 
 
-def test_largest_component_of_each_axis_is_positive_and_runs_are_the_same_bytes():
+def test_signs_are_fixed_and_results_are_identical():
     samples = _samples(50, 200)
     _, axes = principal_axes(samples, dim=6)
     assert (axes.gather(0, axes.abs().argmax(0, keepdim=True)) > 0).all()
@@ -50,7 +50,7 @@ def test_equal_samples_span_no_axis():
 
 
 @pytest.mark.parametrize(("m", "c"), [(20, 300), (300, 20)])
-def test_axes_in_blocks_equal_those_of_scikit_learn_whatever_the_blocks(m, c):
+def test_axes_in_blocks_equal_scikit_learns_for_any_block_size(m, c):
     samples = _samples(m, c).half()
     reference = PCA(n_components=8, svd_solver="full").fit(samples.double().numpy())
     for block in (7, 1000):

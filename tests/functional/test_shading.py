@@ -13,7 +13,7 @@ CUBE_FACES = np.array(
 ).reshape(-1, 3)
 
 
-def test_a_sphere_is_smooth_and_a_cube_keeps_its_edges():
+def test_sphere_is_smooth_and_cube_has_sharp_edges():
     points, faces = icosphere_mesh(2)
     smooth = corner_normals(points, faces, crease_deg=40.0)
     # faces around a vertex are not quite regular: about half a degree
@@ -27,17 +27,17 @@ def test_copies_of_a_vertex_on_a_seam_share_its_normal():
     torn = corner_normals(points[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3), crease_deg=40.0)
     np.testing.assert_allclose(
         torn, corner_normals(points, faces, crease_deg=40.0), atol=1e-12
-    )  # another order of sums
+    )  # different order of summation
 
 
-def test_light_falls_from_both_sides_and_needs_no_unit_vectors():
+def test_shading_is_two_sided_and_ignores_vector_lengths():
     albedo = np.full((3, 3), 100.0)
     normal, light = np.array([[0, 0, 2.0], [0, 0, -5], [1, 0, 0]]), np.array([0, 0, -3.0])
     colour = shade(albedo, normal, np.broadcast_to(light, (3, 3)), ambient=0.4, diffuse=0.5)
     np.testing.assert_allclose(colour[:, 0], [90, 90, 40])
 
 
-def test_fine_stripes_seen_from_afar_are_grey_not_noise():
+def test_fine_stripes_are_grey_from_a_distance():
     stripes = np.zeros((64, 64, 3), np.uint8)
     stripes[:, ::2] = 200
     uv = np.random.default_rng(0).uniform(size=(500, 2))

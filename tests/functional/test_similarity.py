@@ -16,7 +16,7 @@ def _random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_scale_of_query_and_bank_does_not_matter():
+def test_cosines_ignore_the_scale_of_query_and_bank():
     query, bank = _random(6, 4, 4), _random(9, 6, 4, 4, seed=1)
     for function in (global_cosine, cell_cosine):
         assert torch.allclose(function(query, bank), function(3 * query, 0.2 * bank), atol=1e-6)  # float32 rounding
@@ -41,7 +41,7 @@ def test_cell_cosine_equals_a_loop_over_cells():
                 assert abs(float(found[n, i, j]) - expected) < 1e-6  # float32
 
 
-def test_blocks_of_the_bank_change_nothing(monkeypatch):
+def test_result_does_not_depend_on_the_block_size(monkeypatch):
     query, bank = _random(6, 4, 4), _random(9, 6, 4, 4, seed=1)
     whole = cell_cosine(query, bank)
     monkeypatch.setattr(similarity, "_CPU_BLOCK", 200)
@@ -53,7 +53,7 @@ def test_mutual_nearest_pairs_are_best_in_row_and_column():
     assert mutual_nearest(similarity_matrix).tolist() == [[0, 0], [2, 2]]
 
 
-def test_nearest_of_label_equals_a_loop(monkeypatch):
+def test_nearest_with_same_label_equals_a_loop(monkeypatch):
     a, b = l2_normalize(_random(40, 5)), l2_normalize(_random(30, 5, seed=1))
     generator = torch.Generator().manual_seed(2)
     a_label, b_label = torch.randint(0, 6, (40,), generator=generator), torch.randint(0, 5, (30,), generator=generator)
@@ -67,26 +67,26 @@ def test_nearest_of_label_equals_a_loop(monkeypatch):
                 continue
             best = max(members, key=lambda j: float(a[i] @ b[j]))
             assert index[i] == best
-            assert abs(float(value[i] - a[i] @ b[best])) < 1e-6  # float32, another order of sums
+            assert abs(float(value[i] - a[i] @ b[best])) < 1e-6  # float32, different order of summation
 
 
-def test_a_label_far_larger_than_the_others_is_compared_in_parts():
+def test_label_much_larger_than_the_others_is_split():
     a, b = l2_normalize(_random(300, 5)), l2_normalize(_random(200, 5, seed=1))
-    a_label, b_label = (torch.arange(n).sub(n - 30).clamp(min=0) for n in (300, 200))  # 0 but for the last 29
+    a_label, b_label = (torch.arange(n).sub(n - 30).clamp(min=0) for n in (300, 200))  # 0 except for the last 29
     similarity_matrix = (a @ b.T).masked_fill(a_label[:, None] != b_label, -torch.inf)
     value, index = nearest_with_same_label(a, a_label, b, b_label)
     assert torch.equal(index, similarity_matrix.argmax(1))
-    assert torch.allclose(value, similarity_matrix.max(1).values, atol=1e-6)  # float32, another order of sums
+    assert torch.allclose(value, similarity_matrix.max(1).values, atol=1e-6)  # float32, different order of summation
 
 
-def test_best_per_group_keeps_the_highest_and_of_equals_the_first():
+def test_best_per_group_keeps_the_highest_and_breaks_ties_by_index():
     value = torch.tensor([0.5, 0.9, 0.9, 0.1, 0.7, 0.8])
     group = torch.tensor([1, 1, 1, 1, 0, 0])
     candidate = torch.tensor([True, True, True, True, True, False])
     assert best_per_group(value, group, candidate, count=2).tolist() == [4, 1, 2]
 
 
-def test_nothing_to_compare_gives_nothing():
+def test_empty_inputs_give_empty_results():
     value, index = nearest_with_same_label(
         torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(2, 3), torch.tensor([0, 1])
     )

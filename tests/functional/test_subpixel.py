@@ -7,7 +7,7 @@ _CELLS = 24
 
 
 def _field(dx: float = 0.0, dy: float = 0.0) -> torch.Tensor:
-    """Unit features (h w c) of a smooth field seen from (dx, dy) cells aside."""
+    """Unit features (h w c) of a smooth field shifted by (dx, dy) cells."""
     generator = torch.Generator().manual_seed(0)
     wave, phase = torch.randn(16, 20, 2, generator=generator), 6.28 * torch.rand(16, 20, generator=generator)
     y, x = torch.meshgrid(torch.arange(_CELLS) + dy, torch.arange(_CELLS) + dx, indexing="ij")
@@ -20,14 +20,14 @@ def _disc() -> torch.Tensor:
     return centre[:, None] ** 2 + centre**2 < 100
 
 
-def test_a_perfect_match_stays_where_it_is_even_at_the_silhouette():
+def test_perfect_match_does_not_shift_even_at_the_silhouette():
     template, mask = _field(), _disc()
     cell = mask.flatten().nonzero()[:, 0]
     shift = neighbourhood_shift(template.flatten(0, 1)[cell], template, mask, cell, kernel=3)
     assert shift.abs().max() == 0
 
 
-def test_shift_points_to_where_the_query_lies():
+def test_shift_points_towards_the_query():
     template, mask = _field(), torch.ones(_CELLS, _CELLS, dtype=torch.bool)
     cell = _disc().flatten().nonzero()[:, 0]
     for dx, dy in ((0.4, 0.0), (0.0, -0.4), (0.3, 0.3)):
@@ -52,10 +52,10 @@ def test_weighted_mean_equals_a_loop_over_the_neighbourhood():
                         weight = max(float(feature @ template[y + oy, x + ox]), 0.0)
                         total, weights = total + weight * torch.tensor([ox, oy]), weights + weight
             means.append(total / weights)
-        assert torch.allclose(found[i], means[0] - means[1], atol=1e-5)  # float32, another order of sums
+        assert torch.allclose(found[i], means[0] - means[1], atol=1e-5)  # float32, different order of summation
 
 
-def test_kernel_of_one_is_off_and_corners_of_the_map_are_safe():
+def test_kernel_1_is_off_and_map_corners_are_supported():
     template, mask = _field(), torch.ones(_CELLS, _CELLS, dtype=torch.bool)
     corners = torch.tensor([0, _CELLS - 1, _CELLS * (_CELLS - 1), _CELLS**2 - 1])
     query = _field(0.4, 0.4).flatten(0, 1)[corners]

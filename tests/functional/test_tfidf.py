@@ -10,7 +10,7 @@ DOCUMENTS, WORDS = 7, 12
 
 
 def _bag(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Points of seven documents, which document each is of, and words."""
+    """Points of seven documents, the document of each point, and words."""
     generator = torch.Generator().manual_seed(seed)
     points, words = torch.randn(90, 5, generator=generator), torch.randn(WORDS, 5, generator=generator)
     return points, torch.arange(90) % DOCUMENTS, words
@@ -32,10 +32,10 @@ def test_weights_of_a_point_have_length_one_and_fall_with_the_distance():
     equal, gaussian = soft_weights(squared, sigma_squared=None), soft_weights(squared, sigma_squared=2.0)
     assert torch.allclose(equal, torch.full((2, 3), 3**-0.5))
     expected = np.exp(-np.array([0.0, 2.0, 8.0]) / 4)
-    assert np.allclose(gaussian, expected / np.linalg.norm(expected), atol=1e-6)  # far from all words as well
+    assert np.allclose(gaussian, expected / np.linalg.norm(expected), atol=1e-6)  # also far from all words
 
 
-def test_tfidf_is_scikit_learns_without_the_one_added_to_idf():
+def test_tfidf_equals_scikit_learns_without_the_1_added_to_idf():
     """norm="l2", use_idf=True, smooth_idf=False, sublinear_tf=False; its idf is ln(n / df) + 1, ours ln(n / df)."""
     points, document, words = _bag()
     squared, index = nearest_words(points, words, count=1)
@@ -53,7 +53,7 @@ def test_tfidf_is_scikit_learns_without_the_one_added_to_idf():
     assert np.allclose(l2_normalize(soft * idf), reference.transform(soft.numpy()).toarray(), atol=1e-6)
 
 
-def test_a_word_of_every_document_weighs_nothing():
+def test_word_in_every_document_has_weight_0():
     nearest, document = torch.tensor([0, 0, 1]), torch.tensor([0, 1, 1])
     assert inverse_frequency(nearest, document, documents=2, words=3).tolist() == pytest.approx(
         [0, np.log(2), np.log(2)]

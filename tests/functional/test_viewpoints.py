@@ -20,7 +20,7 @@ def farthest_gap_deg(directions: np.ndarray, probes: np.ndarray) -> float:
 
 
 def angles_deg(R_a: np.ndarray, R_b: np.ndarray) -> np.ndarray:
-    """Geodesic angle of every pair."""
+    """Geodesic angle of every pair, degrees."""
     shape = (len(R_a), len(R_b), 3, 3)
     return rotation_angle_deg(np.broadcast_to(R_a[:, None], shape), np.broadcast_to(R_b[None], shape))
 
@@ -32,7 +32,7 @@ def probes():
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_every_set_is_rotations_without_doubles_and_the_same_every_time(name):
+def test_every_set_has_distinct_rotations_and_is_deterministic(name):
     R = viewpoint_rotations(name, 200, 2)
     np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)  # float64
     np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-12)
@@ -62,7 +62,7 @@ def test_sphere_is_closed_and_wound_outwards():
     assert ((np.cross(b - a, c - a) * a).sum(-1) > 0).all()
 
 
-def test_upper_set_looks_down_and_full_sets_look_from_everywhere(probes):
+def test_upper_set_covers_the_hemisphere_and_full_sets_the_sphere(probes):
     eye = -viewpoint_rotations("icosphere_upper", 1)[:, 2]  # the optical axis is the third row
     assert (eye[:, 2] > 0).all()
     assert farthest_gap_deg(eye, probes[probes[:, 2] > 0.1]) < 6  # edges of 7.5 to 9 degrees
@@ -70,7 +70,7 @@ def test_upper_set_looks_down_and_full_sets_look_from_everywhere(probes):
 
 
 @pytest.mark.parametrize("n", [1, 2, 12, 300, 1000])
-def test_fibonacci_covers_the_sphere_at_any_number(n, probes):
+def test_fibonacci_covers_the_sphere_for_any_n(n, probes):
     directions = fibonacci(n)
     assert directions.shape == (n, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-12)
@@ -79,7 +79,7 @@ def test_fibonacci_covers_the_sphere_at_any_number(n, probes):
         assert farthest_gap_deg(directions, probes) < 1.6 * np.degrees(2 / n**0.5)
 
 
-def test_superfibonacci_covers_all_rotations_more_evenly_than_chance():
+def test_superfibonacci_covers_rotations_more_evenly_than_random():
     rng = np.random.default_rng(0)
     q, r = np.linalg.qr(rng.normal(size=(1500, 3, 3)))
     q = q * np.sign(np.diagonal(r, axis1=1, axis2=2))[:, None]
@@ -90,7 +90,7 @@ def test_superfibonacci_covers_all_rotations_more_evenly_than_chance():
     assert gap[0] < 0.75 * gap[1]
 
 
-def test_inplane_turns_keep_the_viewing_direction_and_close_the_circle():
+def test_inplane_rotations_keep_the_viewing_direction_and_complete_the_circle():
     R = viewpoint_rotations("fibonacci", 7)
     turned = add_inplane_turns(R, 4).reshape(7, 4, 3, 3)
     np.testing.assert_allclose(turned[:, 0], R, atol=1e-15)

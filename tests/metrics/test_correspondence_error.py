@@ -1,4 +1,4 @@
-"""Known answers of the correspondence error."""
+"""Known values of the correspondence error."""
 
 import numpy as np
 import pytest
@@ -13,20 +13,20 @@ POINTS = np.random.default_rng(3).uniform(-50, 50, (40, 3))
 NONE = np.eye(4)[None]
 
 
-def test_points_moved_across_the_view_are_off_by_as_much():
+def test_displacement_across_the_view_is_the_error():
     px = project(K, transform(T_GT, POINTS))
     across = T_GT[:3, :3].T @ np.array([3.0, 4.0, 0.0])
     np.testing.assert_allclose(correspondence_errors_mm(POINTS + across, px, K, T_GT, NONE), 5.0, atol=1e-9)
     np.testing.assert_allclose(correspondence_errors_mm(POINTS, px, K, T_GT, NONE), 0.0, atol=1e-9)
 
 
-def test_points_moved_along_their_rays_are_not_off():
+def test_displacement_along_the_ray_is_no_error():
     in_camera = transform(T_GT, POINTS)
     nearer = transform(np.linalg.inv(T_GT), 0.9 * in_camera)
     assert correspondence_errors_mm(nearer, project(K, in_camera), K, T_GT, NONE).max() < 1e-9
 
 
-def test_the_symmetry_with_the_least_median_counts_and_nan_is_left_out():
+def test_best_symmetry_counts_and_nan_is_dropped():
     turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     px = project(K, transform(T_GT @ turn, POINTS))
     points = np.concatenate([POINTS, np.full((1, 3), np.nan)])

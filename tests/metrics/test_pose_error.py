@@ -34,7 +34,7 @@ def test_errors_are_zero_for_the_same_pose(seed: int):
     assert translation_error_mm(T, T) == 0.0
 
 
-def test_order_of_vertices_and_symmetries_changes_nothing():
+def test_errors_do_not_depend_on_the_order_of_vertices_and_symmetries():
     T_est, T_gt, vertices = pose(1), pose(2), cloud(0)
     turns = rigid(Rotation.from_rotvec(np.arange(7)[:, None] * 2 * np.pi / 7 * [0, 0, 1]).as_matrix(), np.zeros((7, 3)))
     shuffled = np.random.default_rng(0).permutation(len(vertices))
@@ -47,7 +47,7 @@ def test_order_of_vertices_and_symmetries_changes_nothing():
     )
 
 
-def test_moving_the_world_changes_no_distance_in_it():
+def test_distances_are_invariant_to_a_common_rigid_motion():
     T_est, T_gt, vertices, move = pose(1), pose(2), cloud(0), pose(3)
     for error in (add, adi):
         # rounding of coordinates of some 1000 mm
@@ -55,17 +55,17 @@ def test_moving_the_world_changes_no_distance_in_it():
     assert rotation_error_deg(move @ T_est, move @ T_gt) == pytest.approx(rotation_error_deg(T_est, T_gt), rel=1e-10)
 
 
-def test_a_symmetric_pose_is_no_error_where_symmetry_is_declared():
+def test_symmetric_pose_has_no_error():
     T, vertices = pose(4), cloud(1)
     half_turn = rigid(np.diag([-1.0, -1.0, 1.0]), np.array([3.0, 4.0, 0.0]))
     symmetries = np.stack([np.eye(4), half_turn])
-    # T @ half_turn is computed once on either side
+    # both sides compute T @ half_turn once
     assert mssd(T @ half_turn, T, vertices, symmetries) < 1e-9
     assert mspd(T @ half_turn, T, K, vertices, symmetries) < 1e-9
     assert mssd(T @ half_turn, T, vertices, NONE) > 10
 
 
-def test_blocks_of_symmetries_give_the_value_of_a_plain_loop():
+def test_blocks_of_symmetries_equal_a_plain_loop():
     T_est, T_gt, vertices = pose(1), pose(2), cloud(0, n=60_000)  # 23 symmetries fit into a block
     angles = np.arange(50)[:, None] * 2 * np.pi / 50
     turns = rigid(Rotation.from_rotvec(angles * [1, 0, 0]).as_matrix(), np.ones((50, 3)))
@@ -76,7 +76,7 @@ def test_blocks_of_symmetries_give_the_value_of_a_plain_loop():
     assert mssd(T_est, T_gt, vertices, turns) == pytest.approx(min(loop), rel=1e-12)  # same sums in another order
 
 
-def test_probes_leave_out_symmetries_and_change_no_value():
+def test_probes_skip_symmetries_without_changing_the_value():
     T_est, T_gt, vertices = pose(1), pose(2), cloud(0, n=500)
     turns = rigid(
         Rotation.from_rotvec(np.arange(315)[:, None] * 2 * np.pi / 315 * [0, 0, 1]).as_matrix(), np.zeros((315, 3))
@@ -86,19 +86,19 @@ def test_probes_leave_out_symmetries_and_change_no_value():
         assert mspd(T_est, T_gt, K, vertices, turns, probes=probes) == pytest.approx(everything, rel=1e-12)
 
 
-def test_a_flat_object_has_all_its_vertices_for_a_hull():
+def test_flat_object_keeps_all_vertices_as_hull():
     flat = cloud(0) * [1, 1, 0]
     assert len(hull_vertices(flat)) == len(flat)
     assert len(hull_vertices(cloud(0, n=500))) < 250
 
 
-def test_a_vertex_in_the_plane_of_the_camera_is_infinitely_far():
+def test_vertex_in_the_camera_plane_has_infinite_error():
     T, vertices = rigid(np.eye(3), np.array([0.0, 0.0, 10.0])), np.array([[1.0, 1.0, -10.0], [0.0, 0.0, 5.0]])
     with np.errstate(divide="ignore", invalid="ignore"):
         assert mspd(T, pose(1), K, vertices, NONE) == np.inf
 
 
-def test_shift_and_turn_of_known_size():
+def test_known_translation_and_rotation():
     T = rigid(np.eye(3), np.array([0.0, 0.0, 500.0]))
     shifted = rigid(np.eye(3), np.array([3.0, 0.0, 504.0]))
     vertices = np.array([[0.0, 0, 0], [10, 0, 0]])

@@ -30,7 +30,7 @@ def test_ar_is_the_mean_of_the_three_recalls_over_instances_and_thresholds():
     assert instance_ar(given).mean() == pytest.approx(recall.ar)
 
 
-def test_without_vsd_there_is_no_ar_and_no_zero_in_its_place():
+def test_without_vsd_ar_is_none_instead_of_0():
     recall = average_recall(scores(vsd=False))
     assert recall.vsd is None
     assert recall.ar is None
@@ -38,7 +38,7 @@ def test_without_vsd_there_is_no_ar_and_no_zero_in_its_place():
     assert set(recall_by_threshold(scores(vsd=False))) == {"mssd", "mspd"}
 
 
-def test_a_lower_bound_of_theta_leaves_out_the_thresholds_above_it():
+def test_theta_max_excludes_higher_thresholds():
     given = scores()
     recall = average_recall(given, theta_max=0.15)
     assert recall.mssd == pytest.approx(given.mssd[:, :3].mean())
@@ -59,7 +59,7 @@ def test_objects_and_bins_of_visibility_cover_every_instance_once():
     assert list(recall_by_visibility(whole)) == [(0.8, 1.0)]
 
 
-def test_scores_read_back_as_they_were_written():
+def test_scores_record_round_trip():
     for given in (scores(), scores(vsd=False), scores(0)):
         given.visib_fract[:1] = np.nan
         back = scores_from_record(scores_to_record(given))
@@ -69,25 +69,25 @@ def test_scores_read_back_as_they_were_written():
         assert back.no_vsd == given.no_vsd
 
 
-def test_an_interval_holds_the_mean_and_narrows_with_more_images():
+def test_interval_contains_the_mean_and_narrows_with_more_images():
     rng = np.random.default_rng(0)
     few, many = rng.random(20), rng.random(2000)
     narrow, wide = mean_interval(many, np.arange(2000) // 2), mean_interval(few, np.arange(20) // 2)
     assert wide.low < few.mean() < wide.high
-    # a tenth of the width, within a third, for a hundred times the images
+    # 100 times the images: a tenth of the width, within a third
     assert (narrow.high - narrow.low) == pytest.approx((wide.high - wide.low) / 10, rel=0.34)
-    # 1.96 standard errors of means of two uniform values either side
+    # 1.96 standard errors of means of two uniform values, on both sides
     assert narrow.high - narrow.low == pytest.approx(2 * 1.96 * np.sqrt(1 / 24 / 1000), rel=0.1)
 
 
-def test_instances_of_one_image_are_drawn_together():
+def test_instances_of_one_image_are_resampled_together():
     values = np.repeat(np.random.default_rng(0).random(10), 50)
     assert mean_interval(values, np.repeat(np.arange(10), 50)).high - values.mean() > 3 * (
         mean_interval(values, np.arange(500)).high - values.mean()
     )
 
 
-def test_a_paired_difference_sees_what_two_intervals_do_not():
+def test_paired_difference_is_significant_where_separate_intervals_overlap():
     rng = np.random.default_rng(0)
     hard, image = rng.random(40), np.arange(40) // 2
     better = hard + 0.02
@@ -98,5 +98,5 @@ def test_a_paired_difference_sees_what_two_intervals_do_not():
     assert not paired_interval(hard, hard, image).excludes_zero
 
 
-def test_images_of_two_scenes_with_one_number_are_two_images():
+def test_images_of_different_scenes_with_the_same_id_are_different():
     assert image_index(np.array([1, 1, 2]), np.array([5, 5, 5])).tolist() == [0, 0, 1]

@@ -1,4 +1,4 @@
-"""bop_toolkit's own values, case by case."""
+"""Comparison with stored values of bop_toolkit."""
 
 import json
 from functools import cached_property
@@ -16,7 +16,7 @@ from pipeline.metrics.pose_error import add, adi, hull_vertices, mspd, mssd, rot
 from pipeline.metrics.vsd import vsd
 from pipeline.stages.render.raycast import render_depth
 
-TOLERANCE = 1e-6  # of bop_toolkit's values as they are stored, in mm, px, degrees or as a share
+TOLERANCE = 1e-6  # of bop_toolkit's stored values, in mm, px, degrees or as a fraction
 
 
 class Reference:
@@ -48,7 +48,7 @@ def reference(bop_reference) -> Reference:
     return Reference(bop_reference)
 
 
-def test_distances_are_those_of_bop_toolkit(reference):
+def test_distances_equal_bop_toolkits(reference):
     assert len(reference.values["cases"]) == 90
     for case in reference.values["cases"]:
         est, gt = reference.poses(case)
@@ -65,12 +65,12 @@ def test_distances_are_those_of_bop_toolkit(reference):
         assert found == pytest.approx({name: case[name] for name in found}, abs=TOLERANCE)
 
 
-def test_shortcuts_give_what_all_vertices_and_symmetries_give(reference):
+def test_hull_and_probes_equal_all_vertices_and_symmetries(reference):
     for case in reference.values["cases"][:30]:
         est, gt = reference.poses(case)
         vertices, symmetries = reference.meshes[case["obj_id"]].vertices, reference.infos[case["obj_id"]].symmetries
         hull = hull_vertices(vertices)
-        # the same sums over other vertices: equal to the last bits
+        # the same sums over other vertices: equal up to rounding
         assert mssd(est, gt, hull, symmetries) == pytest.approx(mssd(est, gt, vertices, symmetries), rel=1e-12)
         all_of_them = mspd(est, gt, reference.K, vertices, symmetries)
         assert mspd(est, gt, reference.K, vertices, symmetries, probes=hull[:5]) == pytest.approx(
@@ -78,27 +78,27 @@ def test_shortcuts_give_what_all_vertices_and_symmetries_give(reference):
         )
 
 
-def test_vsd_on_the_stored_depth_maps_is_that_of_bop_toolkit(reference):
+def test_vsd_of_the_stored_depth_maps_equals_bop_toolkits(reference):
     for index, case in enumerate(reference.values["cases"]):
         est, gt, test = (reference.depth[name][index] for name in ("est", "gt", "test"))
         np.testing.assert_allclose(reference.vsd(case, est, gt, test), case["vsd"], atol=TOLERANCE)
 
 
-def test_vsd_on_our_own_depth_maps_is_close_to_that_of_bop_toolkit(reference):
+def test_vsd_of_our_depth_maps_is_close_to_bop_toolkits(reference):
     for index, case in enumerate(reference.values["cases"]):
         mesh = reference.meshes[case["obj_id"]]
         est, gt = (render_depth(mesh, reference.K, T[None], reference.size_hw)[0] for T in reference.poses(case))
         found = reference.vsd(case, est, gt, reference.depth["test"][index])
-        # another renderer: single pixels of the silhouette
+        # another renderer: single pixels at the silhouette differ
         np.testing.assert_allclose(found, case["vsd"], atol=0.02)
 
 
-def test_symmetries_are_as_many_as_those_of_bop_toolkit(reference):
+def test_number_of_symmetries_equals_bop_toolkits(reference):
     counts = {str(obj_id): len(info.symmetries) for obj_id, info in reference.infos.items()}
     assert counts == reference.values["symmetry_count"]
 
 
-def test_matches_are_those_of_bop_toolkit(bop_reference):
+def test_matches_equal_bop_toolkits(bop_reference):
     cases = json.loads((bop_reference / "matching.json").read_text())
     assert len(cases) == 40
     for case in cases:

@@ -1,4 +1,4 @@
-"""JSON of strangers: scenes, cameras, targets, models_info, detections and rows of reports."""
+"""Untrusted JSON: scenes, cameras, targets, models_info, detections and run records."""
 
 import gzip
 import json
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile import fuzzed, outcome, refused_within
+from hostile import fuzz_settings, message_within, outcome
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_bop import write_tiny_bop
@@ -50,8 +50,8 @@ def detections(root: Path) -> list[dict]:
     return [box, box | {"image_id": 3, "category_id": 2, "segmentation": encode_rle(mask)}]
 
 
-def everything(root: Path) -> None:
-    """Whatever a run reads of a dataset."""
+def read_everything(root: Path) -> None:
+    """Read everything that a run reads from a dataset."""
     data = open_dataset(root, name="tiny")
     for scene_id, im_id in data.images:
         data.image(scene_id, im_id)
@@ -63,8 +63,8 @@ def everything(root: Path) -> None:
         data.object_model(obj_id)
 
 
-def mutated(draw, content):
-    """The content with a value somewhere in it replaced, removed or repeated."""
+def mutate(draw, content):
+    """The content with one value replaced, removed or repeated."""
     steps = draw(st.integers(0, 5))
     at, key, parent = content, None, None
     for _ in range(steps):
@@ -86,8 +86,8 @@ def mutated(draw, content):
     return content
 
 
-def broken(draw, text: str) -> bytes:
-    """The text as bytes, perhaps cut, with bytes changed, in another encoding, or with a mark in front."""
+def corrupt(draw, text: str) -> bytes:
+    """The text as bytes: unchanged, truncated, with bytes changed, in another encoding, or with a byte order mark."""
     data = bytearray(
         text.encode(draw(st.sampled_from(["utf-8", "utf-8", "utf-8-sig", "utf-16", "latin-1"])), "replace")
     )
@@ -97,36 +97,36 @@ def broken(draw, text: str) -> bytes:
     return bytes(data[: draw(st.integers(0, len(data)))] if draw(st.integers(0, 9)) == 0 else data)
 
 
-@fuzzed(80)
+@fuzz_settings(80)
 @given(data=st.data())
-def test_a_dataset_is_read_or_refused_in_one_line(root: Path, data):
+def test_dataset_is_read_or_rejected_in_one_line(root: Path, data):
     path = root / FILES[data.draw(st.sampled_from(sorted(FILES)))]
     whole = path.read_bytes()
-    content = mutated(data.draw, json.loads(whole))
+    content = mutate(data.draw, json.loads(whole))
     try:
         path.write_bytes(
-            broken(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode()
+            corrupt(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode()
         )
-        outcome(lambda: everything(root))
+        outcome(lambda: read_everything(root))
     finally:
         path.write_bytes(whole)
 
 
-@fuzzed(100)
+@fuzz_settings(100)
 @given(data=st.data())
-def test_detections_are_read_or_refused_in_one_line(root: Path, detections, tmp_path_factory, data):
+def test_detections_are_read_or_rejected_in_one_line(root: Path, detections, tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "detections.json"
-    content = mutated(data.draw, json.loads(json.dumps(detections)))
+    content = mutate(data.draw, json.loads(json.dumps(detections)))
     path.write_bytes(
-        broken(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode()
+        corrupt(data.draw, json.dumps(content)) if data.draw(st.booleans()) else json.dumps(content).encode()
     )
     dataset = open_dataset(root, name="tiny")
     outcome(lambda: Json(path=str(path))(dataset, dataset.targets))
 
 
-@fuzzed(60)
+@fuzz_settings(60)
 @given(data=st.data())
-def test_rows_of_reports_are_read_or_refused_in_one_line(tmp_path_factory, data):
+def test_run_records_are_read_or_rejected_in_one_line(tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / "rows"
     folder.mkdir(exist_ok=True)
     row = {
@@ -140,12 +140,12 @@ def test_rows_of_reports_are_read_or_refused_in_one_line(tmp_path_factory, data)
         "dataset": None,
     }
     row |= {"cases": [], "scores": None, "templates": [], "overrides": [], "failures": [], "counts": {}, "times_s": {}}
-    text = json.dumps(mutated(data.draw, row))
-    (folder / "a.json").write_bytes(broken(data.draw, text) if data.draw(st.booleans()) else text.encode())
+    text = json.dumps(mutate(data.draw, row))
+    (folder / "a.json").write_bytes(corrupt(data.draw, text) if data.draw(st.booleans()) else text.encode())
     outcome(lambda: read_run_records(folder.parent))
 
 
-def test_a_row_nested_too_deeply_is_refused(tmp_path: Path):
+def test_deeply_nested_run_record_is_rejected(tmp_path: Path):
     (tmp_path / "rows").mkdir()
     (tmp_path / "rows" / "a.json").write_bytes(b"[" * 100_000)
     assert "a.json: found RecursionError" in outcome(lambda: read_run_records(tmp_path))
@@ -165,54 +165,54 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_hostile_json_is_refused_in_little_time_and_memory(root: Path, tmp_path: Path, case: str):
+def test_hostile_json_is_message_within_limits(root: Path, tmp_path: Path, case: str):
     content, said = HOSTILE[case]
     write_tiny_bop(tmp_path / "tiny")
     (tmp_path / "tiny" / FILES["models_info"]).write_bytes(content)
-    told = refused_within(lambda: everything(tmp_path / "tiny"), seconds=5, megabytes=512)
-    assert "models_info.json" in told
-    assert said in told
+    message = message_within(lambda: read_everything(tmp_path / "tiny"), seconds=5, megabytes=512)
+    assert "models_info.json" in message
+    assert said in message
 
 
 @pytest.mark.parametrize("name", ["²", "1²", "", "--1", "1_0", " 1", "1.0", "9" * 5000])
-def test_a_key_that_is_no_id_is_named(tmp_path: Path, name: str):
+def test_key_that_is_not_an_id_is_reported(tmp_path: Path, name: str):
     write_tiny_bop(tmp_path / "tiny")
     (tmp_path / "tiny" / FILES["scene_camera"]).write_text(json.dumps({name: {}}))
-    told = outcome(lambda: everything(tmp_path / "tiny"))
-    assert f"found the key {name[:40]!r}, needs integer ids as keys" in told
+    message = outcome(lambda: read_everything(tmp_path / "tiny"))
+    assert f"found the key {name[:40]!r}, needs integer ids as keys" in message
 
 
-def test_an_id_written_in_two_ways_is_refused(tmp_path: Path):
+def test_id_written_in_two_ways_is_rejected(tmp_path: Path):
     write_tiny_bop(tmp_path / "tiny")
     (tmp_path / "tiny" / FILES["scene_camera"]).write_text('{"0": {}, "00": {}}')
-    assert "an id written in two ways" in outcome(lambda: everything(tmp_path / "tiny"))
+    assert "an id written in two ways" in outcome(lambda: read_everything(tmp_path / "tiny"))
 
 
-def test_a_byte_order_mark_changes_nothing(tmp_path: Path):
+def test_byte_order_mark_is_ignored(tmp_path: Path):
     write_tiny_bop(tmp_path / "tiny")
     for name in FILES.values():
         path = tmp_path / "tiny" / name
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert outcome(lambda: everything(tmp_path / "tiny")) == "read"
+    assert outcome(lambda: read_everything(tmp_path / "tiny")) == "read"
 
 
-def test_a_packed_file_does_not_fill_the_memory(tmp_path: Path):
+def test_decompression_bomb_is_rejected(tmp_path: Path):
     path = tmp_path / "bomb.json.gz"
     with gzip.open(path, "wb", compresslevel=1) as stream:
         stream.write(b"[" + b" " * (200 << 20) + b"]")
     assert path.stat().st_size < 1 << 20
-    told = refused_within(lambda: read_json(path), seconds=5, megabytes=160)
-    assert "decompress to more than" in told
+    message = message_within(lambda: read_json(path), seconds=5, megabytes=160)
+    assert "decompress to more than" in message
 
 
-def test_packed_detections_of_the_usual_kind_are_read(tmp_path: Path):
+def test_compressed_detections_can_be_read(tmp_path: Path):
     path = tmp_path / "fine.json.gz"
     content = [{"scene_id": i, "bbox": [0, 0, i, i]} for i in range(2000)]
     path.write_bytes(gzip.compress(json.dumps(content).encode()))
     assert read_json(path) == content
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path):
+def test_reading_a_pipe_does_not_block(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.json")
     with pytest.raises(BadInput, match="not a regular file"):
         read_json(tmp_path / "pipe.json")

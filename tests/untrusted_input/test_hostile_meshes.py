@@ -1,4 +1,4 @@
-"""Mesh files of strangers, and the files that they name."""
+"""Untrusted mesh files and the files that they reference."""
 
 import base64
 import json
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hostile import fuzzed, outcome, refused_within, within
+from hostile import fuzz_settings, message_within, outcome, run_within
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -23,7 +23,7 @@ PLY += "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
 SQUARE = [(0, 0, 0), (10, 0, 0), (10, 10, 0), (0, 10, 0)]
 
 
-def whole_files(folder: Path) -> dict[str, bytes]:
+def make_mesh_files(folder: Path) -> dict[str, bytes]:
     """A small mesh in every format, and a textured obj."""
     box, made = trimesh.creation.box((10, 20, 30)), {}
     for suffix in SUFFIXES:
@@ -52,15 +52,15 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(folder: Path) -> dict[str, bytes]:
-    return whole_files(folder)
+    return make_mesh_files(folder)
 
 
 NUMBERS = ["-1", "0", "3", "255", "4294967295", "99999999999999999999", "1e400", "nan", "-inf", "", "\0", "²", "é"]
 
 
-@fuzzed(120)
+@fuzz_settings(120)
 @given(data=st.data())
-def test_a_mesh_is_read_or_refused_in_one_line(folder: Path, whole, data):
+def test_mesh_is_read_or_rejected_in_one_line(folder: Path, whole, data):
     name = data.draw(st.sampled_from(sorted(whole)))
     content = bytearray(whole[name])
     for _ in range(data.draw(st.integers(0, 4))):
@@ -74,7 +74,7 @@ def test_a_mesh_is_read_or_refused_in_one_line(folder: Path, whole, data):
             content[at : at + data.draw(st.integers(0, 3))] = data.draw(st.sampled_from(NUMBERS)).encode()
         else:
             content[at:at] = content[at : at + data.draw(st.integers(1, 200))]
-    path = folder / f"fuzzed{name.strip() if name.startswith('.') else '.' + name.split('.')[-1]}"
+    path = folder / f"fuzz_settings{name.strip() if name.startswith('.') else '.' + name.split('.')[-1]}"
     path.write_bytes(content)
     outcome(lambda: read_mesh(path))
 
@@ -131,36 +131,36 @@ CLAIMS = {
 
 
 @pytest.mark.parametrize("name", CLAIMS)
-def test_what_a_header_claims_costs_neither_time_nor_memory(tmp_path: Path, name: str):
+def test_claimed_mesh_size_costs_neither_time_nor_memory(tmp_path: Path, name: str):
     path = tmp_path / name
     path.write_bytes(CLAIMS[name])
-    assert name in refused_within(lambda: read_mesh(path), seconds=5, megabytes=512)
+    assert name in message_within(lambda: read_mesh(path), seconds=5, megabytes=512)
 
 
-def test_instances_of_instances_are_not_written_out(tmp_path: Path):
-    """Twenty levels of ten children each, all the same node below: a hundred trillion million copies."""
+def test_nested_instances_are_not_expanded(tmp_path: Path):
+    """Twenty levels of ten references to the same node: 10^20 copies."""
     nodes = [{"children": [level + 1] * 10} for level in range(20)] + [{"mesh": 0}]
     points = "data:;base64,AAAAAAAAAAAAAAAAAAAgQQAAAAAAAAAAAAAgQQAAIEEAAAAA"
     stored = {"buffers": [{"uri": points, "byteLength": 36}], "bufferViews": [{"buffer": 0, "byteLength": 36}]}
     document = gltf(3, nodes=nodes, **stored)
     (tmp_path / "copies.gltf").write_bytes(document)
-    within(lambda: read_mesh(tmp_path / "copies.gltf"), seconds=5, megabytes=512)
+    run_within(lambda: read_mesh(tmp_path / "copies.gltf"), seconds=5, megabytes=512)
 
 
-def test_a_texture_may_not_claim_a_giant_image(tmp_path: Path):
+def test_texture_with_a_huge_claimed_size_is_rejected(tmp_path: Path):
     path = tmp_path / "c.obj"
     path.write_text(textured_obj(tmp_path))
     data = bytearray((tmp_path / "skin.png").read_bytes())
     data[16:24] = struct.pack(">II", 200_000, 200_000)
     (tmp_path / "skin.png").write_bytes(data)
-    assert "skin.png" in refused_within(lambda: read_mesh(path), seconds=5, megabytes=512)
+    assert "skin.png" in message_within(lambda: read_mesh(path), seconds=5, megabytes=512)
 
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(ran) print\n%%EOF\n"
 
 
-def test_an_image_that_is_a_program_is_not_run(tmp_path: Path, monkeypatch):
-    """Pillow would hand PostScript to Ghostscript, whatever the file is called."""
+def test_postscript_texture_is_not_run(tmp_path: Path, monkeypatch):
+    """Pillow would run PostScript through Ghostscript, whatever the file's suffix."""
     ran = tmp_path / "ran"
     (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {ran}\n")
     (tmp_path / "gs").chmod(0o755)
@@ -196,7 +196,7 @@ def inside(tmp_path: Path) -> Path:
     return tmp_path / "inside"
 
 
-def test_a_link_out_of_the_meshs_folder_is_not_followed(inside: Path):
+def test_link_out_of_the_meshs_folder_is_not_followed(inside: Path):
     path = inside / "c.obj"
     path.write_text(textured_obj(inside))
     (inside / "skin.png").unlink()
@@ -205,7 +205,7 @@ def test_a_link_out_of_the_meshs_folder_is_not_followed(inside: Path):
         read_mesh(path)
 
 
-def test_a_link_within_the_meshs_folder_is_followed_and_the_folder_may_be_one(inside: Path, tmp_path: Path):
+def test_link_inside_the_meshs_folder_is_followed(inside: Path, tmp_path: Path):
     path = inside / "c.obj"
     path.write_text(textured_obj(inside))
     (inside / "skin.png").rename(inside / "other.png")
@@ -215,14 +215,14 @@ def test_a_link_within_the_meshs_folder_is_followed_and_the_folder_may_be_one(in
 
 
 @pytest.mark.parametrize("name", ["skin\0.png", "a" * 5000 + ".png", ".", "pipe.png", "folder.png", "/dev/zero"])
-def test_a_name_that_is_no_file_is_refused(inside: Path, name: str):
+def test_invalid_companion_name_is_rejected(inside: Path, name: str):
     os.mkfifo(inside / "pipe.png")
     (inside / "folder.png").mkdir()
     ply = PLY.replace("\nelement vertex", f"\ncomment TextureFile {name}\nelement vertex")
     text = ply.format("ascii", 4, 2) + "\n".join(" ".join(map(str, v)) for v in SQUARE) + "\n3 0 1 2\n3 0 2 3\n"
     (inside / "a.ply").write_text(text)
     (inside / "c.obj").write_text(textured_obj(inside, texture=name))
-    told = [outcome(lambda path=path: read_mesh(path)) for path in (inside / "a.ply", inside / "c.obj")]
+    messages = [outcome(lambda path=path: read_mesh(path)) for path in (inside / "a.ply", inside / "c.obj")]
     (inside / "c.obj").write_text(textured_obj(inside, material=name))
-    told.append(outcome(lambda: read_mesh(inside / "c.obj")))
-    assert "read" not in told
+    messages.append(outcome(lambda: read_mesh(inside / "c.obj")))
+    assert "read" not in messages

@@ -1,4 +1,4 @@
-"""What an override or a yaml names is built from specs alone; nothing else is imported, run or listened to."""
+"""Overrides and yaml files can only build specs; no other code is imported or run."""
 
 import os
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from command import run_dzop
-from hostile import fuzzed
+from hostile import fuzz_settings
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_bop import write_tiny_bop
@@ -24,7 +24,7 @@ def chosen(tmp_path_factory) -> tuple[str, ...]:
 
 @pytest.fixture
 def trap(tmp_path: Path, monkeypatch) -> Path:
-    """A module that leaves a file when it is imported."""
+    """A module that writes a file when it is imported."""
     (tmp_path / "trap.py").write_text(TRAP.format(str(tmp_path / "sprung")))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -44,24 +44,22 @@ def trap(tmp_path: Path, monkeypatch) -> Path:
         "match._target_=pipeline.../trap.Trap",
     ],
 )
-def test_what_an_override_names_is_not_imported(capsys, monkeypatch, chosen, trap: Path, override: str):
+def test_override_cannot_import_a_module(capsys, monkeypatch, chosen, trap: Path, override: str):
     ran = run_dzop(capsys, monkeypatch, *chosen, override)
     assert not trap.exists()
     assert "Traceback" not in ran.err
-    if not override.startswith("+x"):  # a field that nobody reads
+    if not override.startswith("+x"):  # an unused field
         assert ran.status == 1
         assert ran.err.startswith("error: ")
 
 
 @pytest.mark.parametrize("name", ["pipeline.store.Store", "pipeline.bop.dataset.Dataset", "pipeline.errors.BadInput"])
-def test_a_class_of_the_package_that_is_no_spec_is_refused(capsys, monkeypatch, chosen, name: str):
+def test_class_that_is_not_a_spec_is_rejected(capsys, monkeypatch, chosen, name: str):
     ran = run_dzop(capsys, monkeypatch, *chosen, f"match._target_={name}")
     assert f"match._target_: found '{name}', needs a class made with @spec" in ran.err
 
 
-def test_ones_own_yaml_may_name_ones_own_class_and_an_override_beside_it_may_not(
-    capsys, monkeypatch, chosen, trap: Path
-):
+def test_own_yaml_may_name_an_own_class_but_an_override_may_not(capsys, monkeypatch, chosen, trap: Path):
     folder = trap.parent / "conf" / "match"
     folder.mkdir(parents=True)
     (folder / "mine.yaml").write_text("_target_: trap.Trap\n")
@@ -88,7 +86,7 @@ def test_a_yaml_in_a_dataset_or_the_working_folder_is_not_read(capsys, monkeypat
 @pytest.mark.parametrize(
     "override", ["match=0", "match.layer=[[[", "match.layer=${x}", "=", "a=b", "match.layer='", "~match", "~out"]
 )
-def test_a_broken_override_is_told_in_one_line(capsys, monkeypatch, chosen, tmp_path: Path, override: str):
+def test_broken_override_is_reported_in_one_line(capsys, monkeypatch, chosen, tmp_path: Path, override: str):
     monkeypatch.chdir(tmp_path)
     ran = run_dzop(capsys, monkeypatch, *chosen, override)
     assert ran.status == 1
@@ -154,7 +152,7 @@ WORDS += [
 ]
 
 
-@fuzzed(5)
+@fuzz_settings(5)
 @given(
     overrides=st.lists(
         st.tuples(st.sampled_from(KEYS), st.sampled_from(WORDS) | st.text(max_size=6)).map("=".join),
@@ -162,21 +160,21 @@ WORDS += [
         max_size=2,
     )
 )
-def test_an_override_is_taken_or_refused_in_one_line(chosen, overrides, tmp_path_factory):
+def test_override_is_accepted_or_rejected_in_one_line(chosen, overrides, tmp_path_factory):
     folder = tmp_path_factory.getbasetemp() / "overrides"
     folder.mkdir(exist_ok=True)
-    overrides = [o for o in overrides if "\0" not in o and o.isprintable()]  # what a shell can hand over
+    overrides = [o for o in overrides if "\0" not in o and o.isprintable()]  # what a shell can pass
     capture = pytest.MonkeyPatch()
     capture.chdir(folder)
     try:
-        told = _ran(capture, [*chosen, *overrides, "plan=true", "out=results"])
+        status = _run_main(capture, [*chosen, *overrides, "plan=true", "out=results"])
     finally:
         capture.undo()
-    assert told is None or isinstance(told, int) or told.startswith("error: "), told
-    assert not isinstance(told, str) or "\n" not in told
+    assert status is None or isinstance(status, int) or status.startswith("error: "), status
+    assert not isinstance(status, str) or "\n" not in status
 
 
-def _ran(patch: pytest.MonkeyPatch, arguments: list[str]) -> object:
+def _run_main(patch: pytest.MonkeyPatch, arguments: list[str]) -> object:
     from pipeline.__main__ import main
 
     patch.setattr(sys, "argv", ["dzop", *arguments])
@@ -205,7 +203,7 @@ finally:
 """
 
 
-def test_a_run_opens_no_port_calls_nobody_and_unpickles_nothing(tmp_path: Path, chosen):
+def test_run_opens_no_port_makes_no_connection_and_unpickles_nothing(tmp_path: Path, chosen):
     arguments = ["render.count=8", "render.viewpoints=fibonacci", "render.size=64", "evaluate.vsd=false", "gallery=0"]
     arguments += [*chosen[1:], "threads=1", f"out={tmp_path / 'results'}"]
     done = subprocess.run(

@@ -1,9 +1,9 @@
-"""Results csv of strangers."""
+"""Untrusted results csv files."""
 
 from pathlib import Path
 
 import pytest
-from hostile import fuzzed, outcome, refused_within
+from hostile import fuzz_settings, message_within, outcome
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_bop import write_tiny_bop
@@ -41,16 +41,16 @@ def data(tmp_path_factory):
     return open_dataset(write_tiny_bop(tmp_path_factory.mktemp("bop") / "tiny"), name="tiny")
 
 
-def scored(path: Path, data) -> None:
-    """Whatever `dzop score` and `dzop lint` make of a csv."""
+def score(path: Path, data) -> None:
+    """Read a csv as `dzop score` and `dzop lint` do."""
     lint(path, data)
     rows = [row for row in read_results(path) if row.scene_id == 7 and row.im_id in (0, 3) and row.obj_id in (1, 2)]
     Scorer(data, data.targets, data.models, vsd_delta_mm=15.0, with_vsd=False).score(rows)
 
 
-@fuzzed(100)
+@fuzz_settings(100)
 @given(drawn=st.data())
-def test_a_csv_is_scored_or_refused_in_one_line(tmp_path_factory, data, drawn):
+def test_csv_is_scored_or_rejected_in_one_line(tmp_path_factory, data, drawn):
     lines = [",".join(COLUMNS)]
     for _ in range(drawn.draw(st.integers(0, 3))):
         cells = ["7", "0", "1", "0.5", *POSE, "0.1"]
@@ -60,7 +60,7 @@ def test_a_csv_is_scored_or_refused_in_one_line(tmp_path_factory, data, drawn):
     text = drawn.draw(st.sampled_from(["\n", "\r\n", "\r", "\n\n"])).join(lines)
     path = tmp_path_factory.getbasetemp() / "m_tiny-test.csv"
     path.write_bytes(text.encode(drawn.draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "latin-1"])), "replace"))
-    outcome(lambda: scored(path, data))
+    outcome(lambda: score(path, data))
 
 
 HOSTILE = {
@@ -74,9 +74,9 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_a_hostile_csv_is_refused_in_little_time_and_memory(tmp_path: Path, case: str):
+def test_hostile_csv_is_message_within_limits(tmp_path: Path, case: str):
     path = tmp_path / "m_tiny-test.csv"
     path.write_bytes(HOSTILE[case])
-    told = refused_within(lambda: read_results(path), seconds=8, megabytes=700)
-    assert "m_tiny-test.csv" in told
-    assert len(told) < 400
+    message = message_within(lambda: read_results(path), seconds=8, megabytes=700)
+    assert "m_tiny-test.csv" in message
+    assert len(message) < 400
