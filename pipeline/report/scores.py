@@ -27,16 +27,20 @@ def scores_table(scored: ScoringResult, *, theta_max: float = 0.5) -> str:
     """Average recalls with intervals, by object and by visible fraction; says why VSD is missing, if it is."""
     scores = scored.scores
     recall = average_recall(scores, theta_max=theta_max)
-    spread = intervals(scored, theta_max=theta_max)
+    interval_of = intervals(scored, theta_max=theta_max)
     lines = [f"\n{'':<10}{'AR':>8}{'AR_VSD':>10}{'AR_MSSD':>10}{'AR_MSPD':>10}"]
-    lines.append(_line("all", recall, f"{len(scores)} instances"))
+    lines.append(_recall_line("all", recall, f"{len(scores)} instances"))
     for name in ("AR", "AR_VSD", "AR_MSSD", "AR_MSPD"):
-        if name in spread:
-            lines.append(f"  {name} 95 % interval over images: {spread[name].low:.3f} to {spread[name].high:.3f}")
-    for obj_id, mine in recall_by_object(scores, theta_max=theta_max).items():
-        lines.append(_line(f"object {obj_id}", mine, f"{int((scores.obj_id == obj_id).sum())} instances"))
-    for (low, high), (count, mine) in recall_by_visibility(scores, theta_max=theta_max).items():
-        lines.append(_line("visible", mine, f"{low:.0%} to {high:.0%}, {count} instances"))
+        if name in interval_of:
+            lines.append(
+                f"  {name} 95 % interval over images: {interval_of[name].low:.3f} to {interval_of[name].high:.3f}"
+            )
+    for obj_id, object_recall in recall_by_object(scores, theta_max=theta_max).items():
+        lines.append(
+            _recall_line(f"object {obj_id}", object_recall, f"{int((scores.obj_id == obj_id).sum())} instances")
+        )
+    for (low, high), (count, visible_recall) in recall_by_visibility(scores, theta_max=theta_max).items():
+        lines.append(_recall_line("visible", visible_recall, f"{low:.0%} to {high:.0%}, {count} instances"))
     lines.append(f"errors on the meshes of {scored.models}")
     if scores.no_vsd:
         lines.append(f"VSD, and with it AR, is not available: {scores.no_vsd}")
@@ -65,11 +69,12 @@ def summary_of(scored: ScoringResult, *, theta_max: float = 0.5) -> dict[str, An
         "instances": len(scores),
         "intervals_95": {name: [i.low, i.high] for name, i in intervals(scored, theta_max=theta_max).items()},
         "objects": {
-            str(obj_id): metrics_of(mine) for obj_id, mine in recall_by_object(scores, theta_max=theta_max).items()
+            str(obj_id): metrics_of(object_recall)
+            for obj_id, object_recall in recall_by_object(scores, theta_max=theta_max).items()
         },
         "visibility": [
-            {"from": low, "to": high, "instances": count, **metrics_of(mine)}
-            for (low, high), (count, mine) in recall_by_visibility(scores, theta_max=theta_max).items()
+            {"from": low, "to": high, "instances": count, **metrics_of(visible_recall)}
+            for (low, high), (count, visible_recall) in recall_by_visibility(scores, theta_max=theta_max).items()
         ],
         "recall_by_threshold": {name: found.tolist() for name, found in recall_by_threshold(scores).items()},
     }
@@ -82,7 +87,7 @@ def metrics_of(recall: AverageRecall) -> dict[str, float | None]:
 
 def error_recalls(scored: ScoringResult) -> dict[str, float | None]:
     """Share of instances with ADD and ADI below 0.1 diameters; median rotation and translation errors of estimates."""
-    nearest = _nearest(scored)
+    nearest = _nearest_errors(scored)
     found = dict.fromkeys(("recall_ADD", "recall_ADI"), 0.0)
     for error in nearest:
         found["recall_ADD"] += (error.add_mm < ADD_LIMIT * error.diameter_mm) / max(len(scored.scores), 1)
@@ -96,7 +101,7 @@ def error_recalls(scored: ScoringResult) -> dict[str, float | None]:
     }
 
 
-def _nearest(scored: ScoringResult) -> list[PoseErrors]:
+def _nearest_errors(scored: ScoringResult) -> list[PoseErrors]:
     """Errors of each estimate against its nearest instance by MSSD."""
     by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
     for error in scored.errors:
@@ -104,7 +109,7 @@ def _nearest(scored: ScoringResult) -> list[PoseErrors]:
     return [min(errors, key=lambda e: e.mssd_mm) for errors in by_row.values()]
 
 
-def _line(name: str, recall: AverageRecall, remark: str) -> str:
+def _recall_line(name: str, recall: AverageRecall, remark: str) -> str:
     cells = "".join(
         f"{'n/a' if value is None else format(value, '.4f'):>{width}}"
         for value, width in zip(metrics_of(recall).values(), (8, 10, 10, 10), strict=True)

@@ -65,7 +65,8 @@ class Scorer:
     def no_vsd(self) -> str:
         """Why VSD is not computed; "" if it is.
 
-        It is left out for all targets if any has no depth image: a missing image is not an error of 1.
+        It is left out for all targets if any has no depth image: a missing image is not an error of 1. The text is part
+        of the cache key of scores.
         """
         if not self.with_vsd:
             return "not asked for"
