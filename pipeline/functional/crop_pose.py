@@ -1,4 +1,4 @@
-"""Poses between the cameras of two crops."""
+"""Conversion of poses between an image's camera and the virtual cameras of crops."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 def pose_in_image(T_crop_obj: Pose, R_crop_cam: Matrix) -> Pose:
-    """T_cam_obj from a pose in the camera of a crop, which is the image's camera turned by ``R_crop_cam``."""
+    """T_cam_obj (mm) from a pose in a crop's camera, which is the image's camera rotated by ``R_crop_cam``."""
     return rigid.rigid(R_crop_cam.T, np.zeros(3)) @ T_crop_obj
 
 
 def transfer_template_pose(
     A_query: Matrix, K_query: Matrix, A_template: Matrix, K_template: Matrix, T_template_obj: Pose
 ) -> Pose:
-    """T_cam_obj (mm) of a query from its template alone: the template's rotation, and the crop's place and scale.
+    """T_cam_obj (mm) of a query for which the object looks in its crop as in the template's crop.
 
-    ``A_*`` and ``K_*``: A_crop_img and the image's K of each; ``T_template_obj``: pose in the template's image.
-    Computed between the cameras of the two crops (camera.crop_camera): the object's origin keeps its place in the crop,
-    depth scales with the focal length, and the rotation turns with the viewing ray so that the object looks the same.
+    ``A_*`` and ``K_*``: A_crop_img and the image's K; ``T_template_obj``: pose in the template's camera. Computed
+    between the cameras of both crops (camera.crop_camera): the object's origin projects to the same crop pixel, depth
+    scales with the focal length, and the rotation follows the viewing ray.
     """
     K_crop, R_crop_cam = camera.crop_camera(A_query, K_query)
     K_template_crop, R_template_cam = camera.crop_camera(A_template, K_template)
