@@ -14,6 +14,7 @@ from make_sam import write_sam
 from PIL import Image as Picture
 from presets import QUICK
 
+from pipeline.backbones.extractor import Extractor
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.detections import write_detections
 from pipeline.bop.masks import encode_rle
@@ -24,7 +25,7 @@ from pipeline.io.meshes import read_mesh, write_ply
 from pipeline.items.features import CLASS_TOKEN_LAYER, FeatureMaps
 from pipeline.items.poses import NoEstimate
 from pipeline.items.views import Crops, Image, Proposal
-from pipeline.spec import Runtime, Spec, spec
+from pipeline.spec import Runtime, spec
 from pipeline.stages.detect.cnos import Cnos
 from pipeline.stages.detect.gt_mask import GtMask
 from pipeline.stages.detect.json import Json
@@ -69,14 +70,11 @@ class TrueMasks(Proposer):
 
 
 @spec
-class Hue(Spec):
+class Hue(Extractor):
     """A class token that is the colour of a crop less its grey: a perfect descriptor of this scene."""
 
     kind: ClassVar[str] = "extract.hue"
-    needs_geometry: ClassVar[bool] = False
-    notice: ClassVar[str] = ""
     model: ClassVar[str] = "hue"
-    timestep: ClassVar[int] = 0
     batch: ClassVar[int] = 7
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:

@@ -1,1 +1,1 @@
-"""Networks behind the extract and detect variants: their code, and how their weights are found and loaded."""
+"""Networks behind the extract and detect variants, the loading of their weights, and the extractor's contract."""

@@ -1,4 +1,4 @@
-"""Memory of an extractor: what it will take, known before any weight is loaded, and the batch that fits."""
+"""Memory that an extractor needs, estimated before any weight is loaded, and the batch size that fits."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import torch
 from pipeline.spec import Runtime
 
 CPU_WORKING_BYTES = 1 << 30  # keeps all of SD 1.5 in float32 under 6 GB; larger batches gain nothing on a CPU
-BUDGET_SHARE = 0.9  # of a budget; the rest is for what libraries take unasked
-MAPS_BYTES = 10  # a value of a map that is returned: float32, a copy of it, and the float16 that is stored
+BUDGET_SHARE = 0.9  # of a budget; the rest is headroom for what libraries allocate on their own
+MAP_VALUE_BYTES = 10  # a value of a returned map: float32, a copy of it, and the float16 that is stored
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """Bytes: of the weights, of a pass however many crops it has, and of each crop in it.
+    """Memory of a model and its passes. A pass of n crops needs ``bytes_per_pass`` + n ``bytes_per_crop``.
 
-    ``max_batch``: crops beyond which a pass gains nothing.
+    ``max_batch``: crops beyond which a larger pass is no faster per crop.
     """
 
     weight_bytes: int
@@ -29,8 +29,8 @@ class Footprint:
 
 
 def maps_bytes(shapes: Sequence[tuple[int, int, int]]) -> int:
-    """What the maps of one crop take until they are stored."""
-    return MAPS_BYTES * sum(c * h * w for c, h, w in shapes)
+    """Bytes of one crop's maps until they are stored."""
+    return MAP_VALUE_BYTES * sum(c * h * w for c, h, w in shapes)
 
 
 def compute_batch_size(footprint: Footprint, runtime: Runtime, device: torch.device, *, ahead: int = 0) -> int:

@@ -1,4 +1,4 @@
-"""How networks convolve: the same sums on every call, since what is cached must not depend on the turn."""
+"""Deterministic convolutions: cached features must not depend on when they were computed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 
 def use_deterministic_convolutions() -> AbstractContextManager[None]:
-    """Within it cuDNN picks deterministic algorithms, and float32 products of float32 values."""
+    """A context in which cuDNN uses deterministic algorithms and full float32 products (no TF32)."""
     flags: AbstractContextManager[None] = torch.backends.cudnn.flags(
         enabled=True, benchmark=False, deterministic=True, allow_tf32=False
     )

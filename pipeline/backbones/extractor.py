@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from pipeline.backbones.batching import Footprint
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Runtime, Variant
+from pipeline.spec import Runtime, Spec
 
 
 class Backbone(Protocol):
@@ -21,46 +22,40 @@ class Backbone(Protocol):
         ...
 
 
-class Extractor(Variant, Protocol):
-    """A spec that knows the shapes of its feature maps, and its weights' digest, before any weight is loaded.
-
-    ``needs_geometry``: True for oracles alone; their crops carry Geometry. ``notice``: a caveat about the features that
-    is printed at the head of every run, "" for none.
-    """
-
-    needs_geometry: ClassVar[bool]
-    notice: ClassVar[str]
+class Extractor(Spec, ABC):
+    """Contract of an extract variant: its name, shapes and memory are known before any weight is loaded."""
 
     @property
+    def needs_geometry(self) -> bool:
+        """True for oracles: their crops carry Geometry."""
+        return False
+
+    @property
+    def notice(self) -> str:
+        """A caveat about the features, printed at the head of every run; "" for none."""
+        return ""
+
+    @property
+    @abstractmethod
     def model(self) -> str:
         """Short name of model and weights for the store's path, e.g. ``stable_diffusion-1a2b3c4d``."""
-        ...
 
     @property
     def timestep(self) -> int:
         """Diffusion timestep; 0 for models without one."""
-        ...
+        return 0
 
+    @abstractmethod
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w) of one crop's map. Raises BadInput for a layer that does not exist."""
-        ...
 
-    def footprint(self, layers: Sequence[int], crop_size: int, device: str) -> Footprint | None:
-        """Memory of passes that compute ``layers`` for crops of that size on "cpu" or "cuda"; None: unknown.
+    def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint | None:
+        """Memory of passes that compute ``layers`` for crops of that size on "cpu" or "cuda".
 
-        Optional, see ``footprint_of``. Raises BadInput for weights that cannot be found.
+        None: unknown, so that memory budgets do not count it. Raises BadInput for weights that cannot be found.
         """
-        ...
+        return None
 
+    @abstractmethod
     def load(self, runtime: Runtime) -> Backbone:
         """Weights into memory. Raises BadInput for weights that are missing or of another class."""
-        ...
-
-
-def footprint_of(extractor: Extractor, layers: Sequence[int], crop_size: int, device: str) -> Footprint | None:
-    """The extractor's footprint; None where it is unknown, which a variant says by returning None or having no method.
-
-    Extractors of unknown size run without a memory budget.
-    """
-    method = getattr(extractor, "footprint", None)
-    return None if method is None else method(layers, crop_size, device)

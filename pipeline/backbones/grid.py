@@ -1,4 +1,4 @@
-"""Layers of the extractors without a network, numbered and sized as Stable Diffusion has them at 512 px, hook pre."""
+"""Layers of the extractors without a network, with the numbers and sizes of Stable Diffusion's at 512 px, hook pre."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pipeline.errors import BadInput
 CELLS = {2: 8, 5: 16, 8: 32, 11: 64}
 
 
-def cells_of(layer: int) -> int:
-    """Cells along a side of a layer's map. Raises BadInput for a layer that does not exist."""
+def count_cells(layer: int) -> int:
+    """Cells along one side of a layer's map. Raises BadInput for a layer that does not exist."""
     if layer not in CELLS:
         raise BadInput("extract layer", found=layer, needed=f"one of {', '.join(map(str, CELLS))}")
     return CELLS[layer]

@@ -1,4 +1,4 @@
-"""A folder as transformers saves it -> the model, whole and quietly. Home of what extract and detect both load."""
+"""A folder written by save_pretrained -> the model, with every weight checked. Used by extract and detect."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from pipeline.io.checkpoints import check_missing, tensor_shapes
 
 
 def load_pretrained(class_name: str, root: Path, tensors: Sequence[Path], **options: Any) -> nn.Module:
-    """The model of a class of transformers, on the CPU, with the weights in ``tensors``.
+    """A model of the transformers class of that name, on the CPU, with the weights in ``tensors``.
 
-    Raises BadInput for files that are broken, and for weights that are missing or do not fit config.json, which
-    transformers would draw at random.
+    Raises BadInput for broken files, and for weights that are missing or do not fit config.json: transformers would
+    initialise those at random.
     """
     import transformers
     from safetensors import SafetensorError
@@ -29,31 +29,31 @@ def load_pretrained(class_name: str, root: Path, tensors: Sequence[Path], **opti
     for path in tensors:
         tensor_shapes(path)
     fixed = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
-    fixed["ignore_mismatched_sizes"] = True  # told below, by name
+    fixed["ignore_mismatched_sizes"] = True  # reported below, with its name
     try:
         with silence_libraries():
-            model, told = cls.from_pretrained(str(root), **fixed, **options)
+            model, info = cls.from_pretrained(str(root), **fixed, **options)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError, SafetensorError) as error:
         raise BadInput(
             tensors[0], found=full_text(error), needed=f"weights of a {class_name} for config.json"
         ) from None
-    if told["mismatched_keys"]:
-        name, stored, needed = min(told["mismatched_keys"])
+    if info["mismatched_keys"]:
+        name, stored, needed = min(info["mismatched_keys"])
         raise BadInput(
             f"{tensors[0]}, tensor {name}", found=tuple(stored), needed=f"{tuple(needed)}, as config.json says"
         )
-    check_missing(sorted(told["missing_keys"]), tensors[0])
+    check_missing(sorted(info["missing_keys"]), tensors[0])
     return model
 
 
 def full_text(error: Exception) -> str:
-    """All of an error's text on one line; the first line alone often names no value."""
+    """An error's text on one line; transformers often names the value after the first line."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 @contextmanager
 def silence_libraries() -> Iterator[None]:
-    """Without the progress bars and remarks of diffusers and transformers while they read weights."""
+    """Suppress the progress bars and warnings of diffusers and transformers while they read weights."""
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging
 

@@ -1,4 +1,4 @@
-"""Weights of SAM and SAM 2: found and checked. safetensors only; nothing is ever unpickled."""
+"""Weights of SAM and SAM 2, located and checked. Only safetensors are read; nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, is_local, read_json, sweep_hint
 
 FIELD = "detect.proposals.weights"
-_NAME = "sam"  # below weights in the configuration
-# model_type of config.json -> class; SAM 2 is published as its video model, whose image part is a Sam2Model
+_NAME = "sam"  # of the field weights.sam in the configuration
+# model_type of config.json -> class; SAM 2 is published as a video model, whose image part is a Sam2Model
 CLASSES = {"sam": "SamModel", "sam2": "Sam2Model", "sam2_video": "Sam2Model"}
 _PATTERNS = ("config.json", "model*.safetensors", "model.safetensors.index.json")
 
 
 @dataclass(frozen=True)
 class SamWeights:
-    """A folder of transformers with the config and weights of a SamModel or a Sam2Model."""
+    """A transformers folder with the config and weights of a SamModel or a Sam2Model."""
 
     root: Path
     class_name: str
 
     @property
     def tensors(self) -> list[Path]:
-        """Files of weights."""
+        """The weight files."""
         return sorted(self.root.glob("model*.safetensors"))
 
     @property
     def files(self) -> dict[str, Path]:
-        """Config and weights, by name."""
+        """Config and weight files, by name."""
         return {path.name: path for path in [self.root / "config.json", *self.tensors]}
 
-    def model(self) -> Any:
+    def load_model(self) -> Any:
         """The model, float32 on the CPU. Raises BadInput for weights that do not fit the config."""
         return load_pretrained(self.class_name, self.root, self.tensors).float()
 
 
 def open_sam_weights(weights: str, revision: str | None) -> SamWeights:
-    """What lies in a folder or at a hub id. Raises BadInput for what is no SAM or no safetensors."""
+    """Locate weights in a folder or at a hub id. Raises BadInput for other models and formats than safetensors."""
     path = Path(weights).expanduser()
     if not is_local(weights):
         path = fetch_snapshot(weights, revision, _PATTERNS, field=FIELD, name=_NAME)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import torch
 
 from pipeline.backbones.batching import Footprint
-from pipeline.backbones.extractor import footprint_of
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.graph.templates import CROPS_PER_BATCH, RERENDER_SCALE, VIEWS_PER_BATCH
@@ -113,7 +112,7 @@ def _backbone_needs(context: Context, proposals: ProposalNodes | None) -> tuple[
     unknown: list[str] = []
     for owner, layers in extractors:
         extract = owner.stages.extract
-        footprint = footprint_of(extract, layers, owner.stages.crop.size, device)
+        footprint = extract.footprint(layers, owner.stages.crop.size, device)
         if footprint is None:
             unknown.append(extract.kind)
         else:

@@ -10,6 +10,7 @@ import torch
 from pipeline.backbones.batching import maps_bytes
 from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES
+from pipeline.items.features import CropFeatures
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
@@ -80,24 +81,23 @@ def test_missing_weights_say_how_to_make_them(tmp_path, monkeypatch):
 
 def test_the_head_fuses_both_sides_alike_at_twice_the_finest_layers_cells():
     maps = Embedded().load(Runtime(device="cpu"))(crops(1), ALL)
-    one = {layer: m[0] for layer, m in maps.items()}
-    mask = torch.ones(128, 128, dtype=torch.bool)
+    one = CropFeatures({layer: m[0] for layer, m in maps.items()}, torch.ones(128, 128, dtype=torch.bool))
     for fuse in (Learned(), Learned(layers=LAYERS)):
-        pair = fuse(one, one, mask, mask)
+        pair = fuse(one, one)
         torch.testing.assert_close(pair.query, pair.template)
-        assert pair.query.shape[-1] == 2 * one[11].shape[-1]
+        assert pair.query.shape[-1] == 2 * one.maps[11].shape[-1]
 
 
 def test_descriptors_and_edges_share_a_cosine_by_the_square_of_their_weight():
     maps = Embedded().load(Runtime(device="cpu"))(crops(2), ALL)
-    sides = [{layer: m[k] for layer, m in maps.items()} for k in (0, 1)]
     mask = torch.ones(128, 128, dtype=torch.bool)
+    query, template = (CropFeatures({layer: m[k] for layer, m in maps.items()}, mask) for k in (0, 1))
 
     def inner(fuse: Learned) -> torch.Tensor:
-        pair = fuse(*sides, mask, mask)
+        pair = fuse(query, template)
         return (pair.query * pair.template).sum(0)
 
-    alone = Learned(layers=LAYERS)(*sides, mask, mask)
+    alone = Learned(layers=LAYERS)(query, template)
     cosine = torch.cosine_similarity(alone.query, alone.template, dim=0)
     torch.testing.assert_close(inner(Learned(edges=2.0)) - cosine, 4 * (inner(Learned(edges=1.0)) - cosine))
 

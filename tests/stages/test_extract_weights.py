@@ -108,19 +108,19 @@ def test_names_of_the_attention_before_diffusers_0_17_are_understood(original: P
             name = name.replace(f"attentions.0.{new}.", f"attentions.0.{former}.")
         tensors[name] = tensor
     save_file(tensors, folder / VAE)
-    ours, theirs = (extractor(path).source.vae(torch.float32).state_dict() for path in (folder, original))
+    ours, theirs = (extractor(path).source.load_vae(torch.float32).state_dict() for path in (folder, original))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
 def test_the_empty_prompt_needs_no_tokenizer(original: Path, folder: Path) -> None:
     shutil.rmtree(folder / "tokenizer")
-    ours, theirs = (extractor(path).source.prompt("") for path in (folder, original))
+    ours, theirs = (extractor(path).source.encode_prompt("") for path in (folder, original))
     assert torch.equal(ours, theirs)
     assert "extract.prompt: found 'a duck' and no tokenizer" in refusal(folder, prompt="a duck")
 
 
 def test_a_prompt_of_any_length_the_encoder_takes(original: Path) -> None:
-    assert extractor(original).source.prompt("a " * 75).shape == (1, 77, 32)
+    assert extractor(original).source.encode_prompt("a " * 75).shape == (1, 77, 32)
     assert "extract.prompt: found 78 tokens, needs at most 77" in refusal(original, prompt="a " * 76)
 
 
@@ -230,5 +230,5 @@ def test_broken_files_are_named(folder: Path) -> None:
 
 
 def test_loading_twice_gives_the_same_weights(original: Path) -> None:
-    first, second = (open_weights(str(original), None).unet(torch.float32).state_dict() for _ in range(2))
+    first, second = (open_weights(str(original), None).load_unet(torch.float32).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)

@@ -1,1 +1,1 @@
-"""Stable Diffusion: its U-Net decoder's features, the noise it is given, and every form its weights come in."""
+"""Stable Diffusion: features of its U-Net's decoder, its noise, and its weights in every published format."""

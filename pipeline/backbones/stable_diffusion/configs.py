@@ -1,4 +1,4 @@
-"""Configs of Stable Diffusion's parts, checked: which models are supported, and their noise schedule."""
+"""Checks of Stable Diffusion's configs: which models are supported; and the noise schedule."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
 
 
 def check_unet(config: Mapping[str, Any], where: Path) -> None:
-    """Raises BadInput, naming the field, for a U-Net that is not that of Stable Diffusion 1.x or 2.x."""
+    """Raise BadInput, naming the field, for a U-Net other than Stable Diffusion 1.x's or 2.x's."""
     check_class(config, "UNet2DConditionModel", where)
     for name in ("addition_embed_type", "class_embed_type", "encoder_hid_dim_type"):
         if config.get(name) is not None:
@@ -33,20 +33,20 @@ def check_unet(config: Mapping[str, Any], where: Path) -> None:
 
 
 def check_class(config: Mapping[str, Any], name: str, where: Path) -> None:
-    """Raises BadInput when a config belongs to another class."""
+    """Raise BadInput for the config of another class."""
     if config.get("_class_name") != name:
         raise BadInput(where, found=f"_class_name {config.get('_class_name')!r}", needed=name)
 
 
 def check_fields(config: Mapping[str, Any], names: Sequence[str], where: Path) -> None:
-    """Raises BadInput when a config lacks a field."""
+    """Raise BadInput for a config that lacks one of the fields."""
     for name in names:
         if not config.get(name):
             raise BadInput(where, found=f"no {name}", needed=f"the config of a {config['_class_name']}")
 
 
 def check_latents(unet: Mapping[str, Any], vae: Mapping[str, Any], where: Path) -> None:
-    """Raises BadInput for a U-Net that takes more than a latent: inpainting, depth, editing, upscaling."""
+    """Raise BadInput for a U-Net with further inputs than the latent: inpainting, depth, editing, upscaling."""
     needed = int(vae.get("latent_channels", 4))
     if unet.get("in_channels", 4) != needed:
         found = f"in_channels {unet['in_channels']}"
@@ -54,7 +54,7 @@ def check_latents(unet: Mapping[str, Any], vae: Mapping[str, Any], where: Path) 
 
 
 def alphas_cumprod(scheduler: Mapping[str, Any], where: Path | None = None) -> Float[np.ndarray, " timesteps"]:
-    """abar_t of a scheduler's config; Stable Diffusion's scaled-linear betas for what it leaves open."""
+    """abar_t of a scheduler's config; missing fields are those of Stable Diffusion's scaled-linear schedule."""
     from diffusers import DDPMScheduler
 
     if "Flow" in str(scheduler.get("_class_name", "")):

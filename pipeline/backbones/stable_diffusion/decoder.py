@@ -1,6 +1,6 @@
-"""The decoder of a Stable Diffusion U-Net: its blocks, their sizes, and a pass that stops at the deepest one asked for.
+"""The decoder of a Stable Diffusion U-Net: its blocks, their sizes, and a pass that stops at the deepest one needed.
 
-Block k is the k-th resnet of the decoder with its attention, counted through the up blocks in order; SD has 4 x 3 = 12.
+Block k is the k-th resnet of the decoder with its attention, counted over all up blocks in order; SD has 4 x 3 = 12.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch import Tensor, nn
 Hook = Literal["pre", "post", "resnet"]
 
 
-class _Reached(Exception):
-    """The deepest block asked for has answered; the rest of the U-Net is not computed."""
+class _AllCollected(Exception):
+    """All requested blocks have been computed, so the rest of the U-Net can be skipped."""
 
 
 def count_blocks(unet: Mapping[str, Any]) -> int:
@@ -25,7 +25,7 @@ def count_blocks(unet: Mapping[str, Any]) -> int:
 
 
 def map_shape(unet: Mapping[str, Any], *, layer: int, hook: Hook, latent_size: int) -> tuple[int, int, int]:
-    """(c, h, w) of a block's map, from the U-Net's config and the side of its latent alone."""
+    """(c, h, w) of a block's map, computed from the U-Net's config and the side of its latent."""
     channels: Sequence[int] = unet["block_out_channels"]
     coarsest = latent_size >> (len(channels) - 1)
     if hook == "pre":
@@ -41,9 +41,9 @@ def map_shape(unet: Mapping[str, Any], *, layer: int, hook: Hook, latent_size: i
 def find_tapped_module(unet: Any, *, layer: int, hook: Hook) -> nn.Module:
     """The module whose output is the map of block ``layer``.
 
-    ``pre``: what enters the block before the skip is concatenated, i.e. the output of block ``layer`` - 1 or of the mid
-    block. ``post``: the block's output; attention, and after an up block's last resnet the upsampler, included.
-    ``resnet``: the residual branch, before the shortcut is added.
+    ``pre``: the block's input before the skip connection is concatenated, i.e. the output of block ``layer`` - 1 or of
+    the mid block. ``post``: the block's output, including attention and, for the last resnet of an up block, the
+    upsampler. ``resnet``: the residual branch, before the shortcut is added.
     """
     if hook == "pre":
         return unet.mid_block if layer == 0 else find_tapped_module(unet, layer=layer - 1, hook="post")
@@ -64,7 +64,7 @@ def read_decoder_maps(
     layers: Sequence[int],
     hook: Hook,
 ) -> dict[int, Float[Tensor, "n _c _h _w"]]:
-    """Maps of the given blocks in one pass of the U-Net, which ends at the deepest of them."""
+    """Maps of the given blocks from one pass of the U-Net, which stops after the deepest of them."""
     wanted = sorted(set(layers))
     maps: dict[int, Tensor] = {}
 
@@ -72,14 +72,14 @@ def read_decoder_maps(
         def listener(_module: nn.Module, _inputs: Any, output: Any) -> None:
             maps[layer] = output if isinstance(output, Tensor) else output[0]
             if len(maps) == len(wanted):
-                raise _Reached
+                raise _AllCollected
 
         return listener
 
     taps = [find_tapped_module(unet, layer=k, hook=hook).register_forward_hook(keep(k)) for k in wanted]
     try:
         unet(latent, torch.tensor(timestep, device=latent.device), prompt.expand(len(latent), -1, -1))
-    except _Reached:
+    except _AllCollected:
         pass
     finally:
         for tap in taps:

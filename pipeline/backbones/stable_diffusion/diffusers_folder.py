@@ -1,4 +1,4 @@
-"""A diffusers folder, local or fetched from the hub -> the parts of Stable Diffusion. Only safetensors are read."""
+"""A diffusers folder, local or downloaded from the hub -> the parts of Stable Diffusion. Only safetensors are read."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from pipeline.backbones.stable_diffusion.loading import (
     allocate_model,
     build_text_encoder,
     drop_decoder,
-    fill,
-    last_hidden_state,
+    encode_text,
+    load_weights,
     tokenize_empty_prompt,
 )
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, first_line, list_pickles, list_shards, read_json
 
 FIELD = "extract.weights"
-NAME = "stable_diffusion"  # below weights in the configuration
+NAME = "stable_diffusion"  # of the field weights.stable_diffusion in the configuration
 _TOKENIZER_FILES = ("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
 _STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
 
 
 @dataclass(frozen=True)
 class DiffusersFolder:
-    """A folder as diffusers' save_pretrained writes it: unet, vae, text_encoder; tokenizer and scheduler if present."""
+    """A folder written by diffusers' save_pretrained: unet, vae, text_encoder; tokenizer and scheduler if present."""
 
     root: Path
 
     @property
     def files(self) -> dict[str, Path]:
-        """Configs and weights in use; a file nobody reads does not count."""
+        """Configs and weights that are read; other files in the folder do not matter."""
         paths = [self._json(part) for part in _STEMS]
         paths += [path for part in _STEMS for path in self._tensors(part)]
         paths += [self.root / "scheduler" / "scheduler_config.json"]
@@ -67,19 +67,19 @@ class DiffusersFolder:
             unet, vae, alphas_cumprod(read_json(scheduler) if scheduler.exists() else {}, scheduler)
         )
 
-    def unet(self, dtype: torch.dtype) -> nn.Module:
+    def load_unet(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
         from diffusers import UNet2DConditionModel
 
-        return self._filled(self._empty(UNet2DConditionModel, "unet", dtype), "unet")
+        return self._fill(self._empty(UNet2DConditionModel, "unet", dtype), "unet")
 
-    def vae(self, dtype: torch.dtype) -> nn.Module:
+    def load_vae(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
         from diffusers import AutoencoderKL
 
-        return self._filled(drop_decoder(self._empty(AutoencoderKL, "vae", dtype)), "vae")
+        return self._fill(drop_decoder(self._empty(AutoencoderKL, "vae", dtype)), "vae")
 
-    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+    def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
         """See Weights."""
         config, width = self._config("text_encoder"), self._config("unet")["cross_attention_dim"]
         if config.get("hidden_size") != width:
@@ -87,8 +87,8 @@ class DiffusersFolder:
             raise BadInput(self._json("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
         ids = self._token_ids(text, config)
         outer, inner = build_text_encoder(config, self._json("text_encoder"))
-        self._filled(inner, "text_encoder")
-        return last_hidden_state(outer, ids)
+        self._fill(inner, "text_encoder")
+        return encode_text(outer, ids)
 
     def _token_ids(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
         folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
@@ -119,7 +119,7 @@ class DiffusersFolder:
         return read_json(path)
 
     def _tensors(self, part: str) -> list[Path]:
-        """Files of a part's weights, full precision where there is a choice: one, or an index and its shards."""
+        """Weight files of a part: one, or an index and its shards; full precision is preferred to half."""
         folder, stem = self.root / part, _STEMS[part]
         for variant in ("", ".fp16"):
             index = folder / f"{stem}.safetensors.index{variant}.json"
@@ -135,13 +135,13 @@ class DiffusersFolder:
     def _empty(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
         return allocate_model(cls, self._config(part), dtype, self._json(part))
 
-    def _filled(self, model: nn.Module, part: str) -> nn.Module:
-        fill(model, [path for path in self._tensors(part) if path.suffix == ".safetensors"])
+    def _fill(self, model: nn.Module, part: str) -> nn.Module:
+        load_weights(model, [path for path in self._tensors(part) if path.suffix == ".safetensors"])
         return model
 
 
 def download(hub_id: str, revision: str | None) -> Path:
-    """Folder of the hub's files that are needed; the half-precision ones only where there are no others."""
+    """Download the files that are needed; half precision only where there is no full precision."""
     for variant in ("", ".fp16"):
         folder = fetch_snapshot(hub_id, revision, _patterns(variant), field=FIELD, name=NAME)
         if any((folder / "unet").glob("*.safetensors")):

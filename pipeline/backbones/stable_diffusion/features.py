@@ -1,4 +1,4 @@
-"""crops -> feature maps of a latent diffusion model's decoder, whatever its weights.
+"""crops -> feature maps of a latent diffusion model's decoder: the base of such extractors.
 
 Tang et al., NeurIPS 2023 (DIFT) and Zhang et al., NeurIPS 2023 (A Tale of Two Features): encode the image, noise the
 latent once, run the U-Net once, read its decoder.
@@ -6,10 +6,10 @@ latent once, run the U-Net once, read its decoder.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,19 +19,20 @@ from torch.nn.functional import interpolate
 
 from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
 from pipeline.backbones.determinism import use_deterministic_convolutions
+from pipeline.backbones.extractor import Extractor
 from pipeline.backbones.stable_diffusion.decoder import Hook, count_blocks, map_shape, read_decoder_maps
 from pipeline.backbones.stable_diffusion.noise import NoiseMode, add_noise, draw_noise
 from pipeline.errors import BadInput
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
+from pipeline.spec import Dtype, NonNegative, Positive, Runtime, spec
 
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
 
 
 @dataclass(frozen=True, eq=False)
 class DiffusionConfigs:
-    """What is known of a model before its weights: the configs of U-Net and VAE as diffusers has them, and abar_t."""
+    """A model's diffusers configs of U-Net and VAE, and abar_t of its noise schedule."""
 
     unet: Mapping[str, Any]
     vae: Mapping[str, Any]
@@ -39,12 +40,12 @@ class DiffusionConfigs:
 
     @property
     def vae_factor(self) -> int:
-        """Image pixels per latent cell, along a side."""
+        """Image pixels per latent cell, along one side."""
         return 1 << (len(self.vae["block_out_channels"]) - 1)
 
     @property
     def size_step(self) -> int:
-        """Input sizes must be multiples of this, or maps of encoder and decoder do not meet."""
+        """Pixels that input sizes must be a multiple of, so that encoder and decoder maps have equal sizes."""
         return self.vae_factor << (len(self.unet["block_out_channels"]) - 1)
 
 
@@ -58,16 +59,13 @@ class LoadedModel:
 
 
 @spec
-class DiffusionFeatures(Spec, ABC):
+class DiffusionFeatures(Extractor):
     """Base of all latent diffusion extractors, with their common parameters.
 
     ``hook``: what "layer k" means (``decoder.find_tapped_module``). ``noise="none"``: the U-Net gets the clean latent,
     without noise and unscaled, at the same timestep. ``ensemble``: features are averaged over that many noise samples,
     drawn with ``seed``, ``seed`` + 1, ...
     """
-
-    needs_geometry: ClassVar[bool] = False
-    notice: ClassVar[str] = ""
 
     hook: Hook = "pre"
     input_size: Positive = 512
@@ -80,14 +78,14 @@ class DiffusionFeatures(Spec, ABC):
     @property
     @abstractmethod
     def configs(self) -> DiffusionConfigs:
-        """Configs alone; no weights are loaded."""
+        """The model's configs; no weights are loaded."""
 
     @abstractmethod
     def load_model(self) -> LoadedModel:
-        """Weights into memory."""
+        """The model with its weights, on the CPU."""
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe; without noise, neither its seed nor the size of its ensemble can matter."""
+        """As Spec.recipe; without noise its seed and the ensemble have no effect and get fixed values."""
         return super().recipe() | ({"seed": 0, "ensemble": 1} if self.noise == "none" else {})
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
@@ -103,23 +101,22 @@ class DiffusionFeatures(Spec, ABC):
         _check(self, configs, ())
         device = torch.device(runtime.torch_device())
         model = self.load_model()
-        placed = LoadedModel(_ready(model.unet, device), _ready(model.vae, device), model.prompt.to(device))
-        working = _working(self, configs, device.type)
-        batch = runtime.batch or compute_batch_size(working, runtime, device)
+        placed = LoadedModel(_place(model.unet, device), _place(model.vae, device), model.prompt.to(device))
+        passes = _pass_footprint(self, configs, device.type)
+        batch = runtime.batch or compute_batch_size(passes, runtime, device)
         return DiffusionBackbone(self, configs, placed, batch)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As fitting.Sized: the weights are counted on models without memory."""
+        """As Extractor.footprint; weights are counted on meta tensors, which take no memory."""
         from diffusers import AutoencoderKL, UNet2DConditionModel
 
-        working = _working(self, self.configs, device)
+        passes = _pass_footprint(self, self.configs, device)
         _check(self, self.configs, layers)
-        values = count_parameters(UNet2DConditionModel, self.configs.unet) + count_parameters(
-            AutoencoderKL, self.configs.vae, without="decoder"
-        )
+        values = count_parameters(UNet2DConditionModel, self.configs.unet)
+        values += count_parameters(AutoencoderKL, self.configs.vae, without="decoder")
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
         return Footprint(
-            values * _bytes_per_value(self), working.bytes_per_pass, working.bytes_per_crop + maps, working.max_batch
+            values * _bytes_per_value(self), passes.bytes_per_pass, passes.bytes_per_crop + maps, passes.max_batch
         )
 
 
@@ -130,10 +127,10 @@ class DiffusionBackbone:
         self.spec, self.configs, self.model, self.batch = spec, configs, model, batch
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        """Maps of the given layers in the spec's dtype, on the model's device; at most ``batch`` crops at a time."""
+        """Maps of the given layers in the spec's dtype, on the model's device, computed ``batch`` crops at a time."""
         _check(self.spec, self.configs, layers)
         chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
-        # concatenated outside inference mode: the maps are ordinary tensors again, free for use in place
+        # outside inference mode, so that the result is an ordinary tensor that may be changed in place
         return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
 
     @torch.inference_mode()
@@ -141,10 +138,10 @@ class DiffusionBackbone:
         with use_deterministic_convolutions():
             latent = self._latent(crops.rgb)
             members = 1 if self.spec.noise == "none" else self.spec.ensemble
-            return _mean([self._maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
+            return _average([self._maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
 
     def _latent(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n c h w"]:
-        # one by one on the CPU, where a batch gains nothing and the VAE's first maps are the largest of all
+        # one by one on the CPU: a batch is no faster there, and the VAE's first maps are the largest of all
         step = 1 if self.model.prompt.device.type == "cpu" else len(rgb)
         images = [self._image(rgb[i : i + step]) for i in range(0, len(rgb), step)]
         return torch.cat([encode_latent(self.model.vae, self.configs.vae, image) for image in images])
@@ -163,7 +160,7 @@ class DiffusionBackbone:
 
 
 def to_network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tensor, "n 3 H W"]:
-    """Images in [-1, 1], resized with pixel edges on pixel edges (camera.resize_affine); shrinking is antialiased."""
+    """Images in [-1, 1], resized so that image edges coincide (camera.resize_affine); shrinking is antialiased."""
     image = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1
     if image.shape[-1] == size:
         return image
@@ -171,18 +168,18 @@ def to_network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tenso
 
 
 def encode_latent(vae: Any, config: Mapping[str, Any], image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
-    """(posterior mean - shift_factor) times scaling_factor (Rombach et al., CVPR 2022, App. G); no draw."""
+    """(posterior mean - shift_factor) * scaling_factor (Rombach et al., CVPR 2022, App. G); nothing is sampled."""
     mean = vae.encode(image).latent_dist.mean
     return (mean - (config.get("shift_factor") or 0.0)) * config.get("scaling_factor", 0.18215)
 
 
-def _mean(members: Sequence[FeatureMaps]) -> FeatureMaps:
+def _average(members: Sequence[FeatureMaps]) -> FeatureMaps:
     if len(members) == 1:
         return members[0]
     return {k: torch.stack([maps[k].float() for maps in members]).mean(0).to(members[0][k].dtype) for k in members[0]}
 
 
-def _ready(model: Any, device: torch.device) -> nn.Module:
+def _place(model: Any, device: torch.device) -> nn.Module:
     model.eval().requires_grad_(False)
     if device.type == "cuda":
         return model.to(device, memory_format=torch.channels_last)
@@ -203,7 +200,7 @@ def _check(spec: DiffusionFeatures, configs: DiffusionConfigs, layers: Sequence[
 
 
 def count_parameters(cls: Any, config: Mapping[str, Any], *, without: str = "") -> int:
-    """Values of a diffusers model, of all its parts but one if told so; nothing is set aside for them."""
+    """Parameters of a diffusers model, not counting the part named ``without``; no memory is allocated."""
     with torch.device("meta"):
         model = cls.from_config(dict(config))
     return sum(p.numel() for name, p in model.named_parameters() if not without or not name.startswith(without))
@@ -213,8 +210,8 @@ def _bytes_per_value(spec: DiffusionFeatures) -> int:
     return 4 if spec.dtype == "float32" else 2
 
 
-def _working(spec: DiffusionFeatures, configs: DiffusionConfigs, device: str) -> Footprint:
-    """A pass by its largest maps: the VAE's first level, one by one on a CPU, and the U-Net's first with its skips."""
+def _pass_footprint(spec: DiffusionFeatures, configs: DiffusionConfigs, device: str) -> Footprint:
+    """Estimate of a pass from its largest maps: the VAE's first level (one image on a CPU), the U-Net's with skips."""
     latent_size = spec.input_size // configs.vae_factor
     unet = 60 * configs.unet["block_out_channels"][0] * latent_size**2 * _bytes_per_value(spec)
     vae = 6 * configs.vae["block_out_channels"][0] * spec.input_size**2 * _bytes_per_value(spec)

@@ -1,4 +1,4 @@
-"""Weights of Stable Diffusion into the models of diffusers and transformers: empty ones made, filled, asked."""
+"""Loads weights of Stable Diffusion into models of diffusers and transformers, without a second copy in memory."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from pipeline.backbones.pretrained import silence_libraries
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import check_missing, first_line, tensor_shapes
 
+NameMap = Callable[[str], str | None]
+
 _ATTENTION_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
-_PORTION = 1 << 26  # values read before a file is mapped anew
+_PORTION = 1 << 26  # values read before a file is unmapped and mapped again
 _BOS, _EOS = 49406, 49407  # of CLIP's vocabulary (Radford et al., ICML 2021)
 
 
@@ -34,7 +36,7 @@ def tokenize_empty_prompt(text: str, where: Path, *, open_clip: bool, length: in
 
 
 def allocate_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
-    """A model of a diffusers class, its memory set aside and not yet written to. Raises BadInput."""
+    """A model of a diffusers class with uninitialised weights. Raises BadInput for a config it does not take."""
     try:
         with torch.device("meta"), silence_libraries():
             model = cls.from_config(dict(config)).to(dtype)
@@ -44,28 +46,28 @@ def allocate_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, wher
 
 
 def allocate_unet(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
-    """An empty UNet2DConditionModel. Raises BadInput as ``allocate_model``."""
+    """An uninitialised UNet2DConditionModel. Raises BadInput as ``allocate_model``."""
     from diffusers import UNet2DConditionModel
 
     return allocate_model(UNet2DConditionModel, config, dtype, where)
 
 
 def allocate_encoder(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
-    """An empty AutoencoderKL with its encoder alone. Raises BadInput as ``allocate_model``."""
+    """An uninitialised AutoencoderKL without its decoder. Raises BadInput as ``allocate_model``."""
     from diffusers import AutoencoderKL
 
     return drop_decoder(allocate_model(AutoencoderKL, config, dtype, where))
 
 
 def build_untrained(unet: dict[str, Any], vae: dict[str, Any]) -> tuple[Any, Any]:
-    """U-Net and autoencoder of the given configs, freshly initialised: for training."""
+    """U-Net and autoencoder with the default initialisation, for training."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     return UNet2DConditionModel(**unet), AutoencoderKL(**vae)
 
 
 def build_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Module, nn.Module]:
-    """A CLIPTextModel, and the part of it that holds the weights: itself, within a wrapper until transformers 5.6."""
+    """A CLIPTextModel, and the module that holds its weights: a submodule before transformers 5.6, then itself."""
     from transformers import CLIPTextConfig, CLIPTextModel
 
     try:
@@ -77,17 +79,19 @@ def build_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Mod
 
 
 def modernize_name(name: str) -> str:
-    """A weight's name today: no wrapper around the text encoder; the VAE's attention as since diffusers 0.17."""
+    """A weight's current name: without the text encoder's wrapper; the VAE's attention as of diffusers 0.17."""
     name = name.removeprefix("text_model.")
-    former = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
-    return former[1] + _ATTENTION_NAMES[former[2]] + former[3] if former else name
+    old = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
+    return old[1] + _ATTENTION_NAMES[old[2]] + old[3] if old else name
 
 
-def fill(model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = modernize_name) -> None:
-    """Weights from safetensors files into a model's own memory. Raises BadInput for ones that do not fit.
+def load_weights(
+    model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = modernize_name
+) -> None:
+    """Copy weights from safetensors files into a model. Raises BadInput for missing weights and other shapes.
 
-    ``name_of``: the model's name of a stored tensor. A file stays mapped for some hundred megabytes only: what has been
-    read of it would count as a second copy.
+    ``name_of``: maps a stored tensor's name to the model's, None to skip it. A file is mapped again every few hundred
+    megabytes, because the pages already read would count as a second copy of the weights.
     """
     from safetensors import safe_open
 
@@ -115,9 +119,9 @@ def _portions(names: Iterable[str], parameters: Mapping[str, nn.Parameter]) -> l
 
 
 def copy_weight(value: Tensor, parameter: nn.Parameter, where: str) -> None:
-    """A stored weight into a model's memory. Raises BadInput for another shape."""
+    """Copy a stored weight into a parameter. Raises BadInput for another shape."""
     if value.numel() == parameter.numel() and value.ndim > parameter.ndim:
-        value = value.view(parameter.shape)  # 1x1 kernels that became matrices
+        value = value.view(parameter.shape)  # 1x1 kernels, stored before they became matrices
     if value.shape != parameter.shape:
         raise BadInput(
             where, found=f"shape {tuple(value.shape)}", needed=f"{tuple(parameter.shape)}, as the config says"
@@ -125,13 +129,13 @@ def copy_weight(value: Tensor, parameter: nn.Parameter, where: str) -> None:
     parameter.copy_(value)
 
 
-def last_hidden_state(text_encoder: nn.Module, ids: Int[Tensor, "1 l"]) -> Float[Tensor, "1 l d"]:
-    """The text encoder's answer after its final layer norm, float32."""
+def encode_text(text_encoder: nn.Module, ids: Int[Tensor, "1 l"]) -> Float[Tensor, "1 l d"]:
+    """The text encoder's output after its final layer norm, float32."""
     with torch.no_grad():
         return text_encoder.float().eval()(ids)[0].clone()
 
 
 def drop_decoder(vae: Any) -> nn.Module:
-    """The VAE with its encoder alone."""
+    """Remove the VAE's decoder, which features do not need."""
     vae.decoder, vae.post_quant_conv = None, None
     return vae

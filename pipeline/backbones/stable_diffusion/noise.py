@@ -1,4 +1,4 @@
-"""The one noising step of diffusion features: which noise, and how much of it."""
+"""The noise of diffusion features: how it is drawn, and how it is added to the latent."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def draw_noise(
     seed: int,
     shape: tuple[int, int, int],
 ) -> Float[Tensor, "n c h w"]:
-    """Unit Gaussian noise for n crops, drawn on the CPU so that every device gets the same numbers.
+    """Unit Gaussian noise for n crops, drawn on the CPU so that every device gets the same values.
 
-    ``shared``: one tensor for all crops. ``independent``: a crop's own content seeds its noise, so neither the batch
-    nor the order of the crops can change it.
+    ``shared``: one tensor for all crops. ``independent``: each crop's content seeds its noise, which is therefore
+    independent of batch and order.
     """
     if mode == "shared":
-        return _gaussian(seed, shape).expand(len(rgb), *shape)
-    return torch.stack([_gaussian(_content_seed(seed, rgb[i], mask[i]), shape) for i in range(len(rgb))])
+        return _draw_gaussian(seed, shape).expand(len(rgb), *shape)
+    return torch.stack([_draw_gaussian(_content_seed(seed, rgb[i], mask[i]), shape) for i in range(len(rgb))])
 
 
 def add_noise(
@@ -38,7 +38,7 @@ def add_noise(
     return alpha_cumprod**0.5 * latent + (1 - alpha_cumprod) ** 0.5 * noise
 
 
-def _gaussian(seed: int, shape: tuple[int, int, int]) -> Float[Tensor, "c h w"]:
+def _draw_gaussian(seed: int, shape: tuple[int, int, int]) -> Float[Tensor, "c h w"]:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 

@@ -1,4 +1,4 @@
-"""One .safetensors file in the layout of CompVis and Stability: configs are read off the shapes of its tensors."""
+"""One .safetensors file in the layout of CompVis and Stability; its configs are inferred from tensor shapes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pipeline.backbones.stable_diffusion.loading import (
     build_text_encoder,
     copy_weight,
     drop_decoder,
-    fill,
-    last_hidden_state,
+    encode_text,
+    load_weights,
     tokenize_empty_prompt,
 )
 from pipeline.errors import BadInput
@@ -45,18 +45,18 @@ _OPEN_CLIP_NAMES = {
 
 @dataclass(frozen=True)
 class SingleFile:
-    """Weights of U-Net, VAE and text encoder in one file; see weights.Weights."""
+    """U-Net, VAE and text encoder in one file; see source.Weights."""
 
     path: Path
 
     @property
     def files(self) -> dict[str, Path]:
-        """The file."""
+        """The file itself."""
         return {"model.safetensors": self.path}
 
     @cached_property
     def shapes(self) -> Shapes:
-        """Shapes by tensor name, checked to be of the original layout."""
+        """Shapes by tensor name. Raises BadInput for a file that is not in the original layout."""
         shapes = tensor_shapes(self.path)
         for prefix in (_UNET, _VAE, "cond_stage_model."):
             if not any(name.startswith(prefix) for name in shapes):
@@ -65,55 +65,55 @@ class SingleFile:
         return shapes
 
     def read_configs(self) -> DiffusionConfigs:
-        """Configs that the shapes imply; the noise schedule is Stable Diffusion's."""
+        """Configs inferred from the shapes; the noise schedule is Stable Diffusion's."""
         try:
-            unet, vae = unet_config(below(self.shapes, _UNET)), vae_config(below(self.shapes, _VAE))
+            unet, vae = unet_config(select_prefix(self.shapes, _UNET)), vae_config(select_prefix(self.shapes, _VAE))
         except KeyError as error:
             needed = "the tensors of Stable Diffusion 1.x or 2.x"
             raise BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed) from None
-        if "label_emb.0.0.weight" in below(self.shapes, _UNET):
+        if "label_emb.0.0.weight" in select_prefix(self.shapes, _UNET):
             raise BadInput(self.path, found=f"{_UNET}label_emb", needed="Stable Diffusion 1.x or 2.x, not XL")
         check_latents(unet, vae, self.path)
         return DiffusionConfigs(unet, vae, alphas_cumprod({}))
 
-    def unet(self, dtype: torch.dtype) -> nn.Module:
+    def load_unet(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
         from diffusers import UNet2DConditionModel
         from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
 
         config = self.read_configs().unet
         model = allocate_model(UNet2DConditionModel, config, dtype, self.path)
-        # names in place of tensors: the converter of a U-Net does nothing but rename
-        theirs = convert_ldm_unet_checkpoint({n: n for n in self.shapes if n.startswith(_UNET)}, dict(config))
-        fill(model, [self.path], {stored: name for name, stored in theirs.items()}.get)
+        # names in place of tensors: the converter of a U-Net only renames
+        renamed = convert_ldm_unet_checkpoint({n: n for n in self.shapes if n.startswith(_UNET)}, dict(config))
+        load_weights(model, [self.path], {stored: name for name, stored in renamed.items()}.get)
         return model
 
-    def vae(self, dtype: torch.dtype) -> nn.Module:
+    def load_vae(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
         from diffusers import AutoencoderKL
         from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
 
         config = self.read_configs().vae
         model = drop_decoder(allocate_model(AutoencoderKL, config, dtype, self.path))
-        return self._filled(model, convert_ldm_vae_checkpoint(self._tensors(_VAE), dict(config)))
+        return self._fill(model, convert_ldm_vae_checkpoint(self._tensors(_VAE), dict(config)))
 
-    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
-        """See Weights; there is no tokenizer in such a file, so the text can only be empty."""
+    def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+        """See Weights. Such a file has no tokenizer, so only the empty text is possible."""
         is_open = any(name.startswith(_OPEN_CLIP) for name in self.shapes)
         prefix = _OPEN_CLIP if is_open else _CLIP
         state = {name.removeprefix(prefix): tensor for name, tensor in self._tensors(prefix).items()}
         try:
-            state = open_clip_as_clip(state) if is_open else _unwrapped(state)
+            state = convert_open_clip(state) if is_open else _strip_wrapper(state)
             config = text_config({name: tuple(t.shape) for name, t in state.items()}, open_clip=is_open)
         except KeyError as error:
             needed = "the text encoder of CLIP or OpenCLIP"
             raise BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed) from None
         ids = tokenize_empty_prompt(text, self.path, open_clip=is_open, length=config["max_position_embeddings"])
         outer, inner = build_text_encoder(config, self.path)
-        self._filled(inner, state)
-        return last_hidden_state(outer, ids)
+        self._fill(inner, state)
+        return encode_text(outer, ids)
 
-    def _filled(self, model: nn.Module, state: Mapping[str, Tensor]) -> nn.Module:
+    def _fill(self, model: nn.Module, state: Mapping[str, Tensor]) -> nn.Module:
         missing = dict(model.named_parameters())
         with torch.no_grad():
             for name in missing.keys() & state.keys():
@@ -128,13 +128,13 @@ class SingleFile:
             return {name: tensors.get_tensor(name) for name in self.shapes if name.startswith(prefix)}
 
 
-def below(shapes: Shapes, prefix: str) -> Shapes:
-    """Shapes under a prefix, without it."""
+def select_prefix(shapes: Shapes, prefix: str) -> Shapes:
+    """Shapes of the tensors whose name starts with a prefix, by the rest of their name."""
     return {name.removeprefix(prefix): shape for name, shape in shapes.items() if name.startswith(prefix)}
 
 
 def unet_config(shapes: Shapes) -> dict[str, Any]:
-    """Config of a UNet2DConditionModel whose input blocks are, level by level, resnets and then a downsampler."""
+    """Config of a UNet2DConditionModel; each level of its input blocks is some resnets, then a downsampler."""
     levels: list[list[int]] = [[]]
     attends: list[bool] = [False]
     for block in range(1, 1 + _highest(shapes, r"input_blocks\.(\d+)\.")):
@@ -189,14 +189,14 @@ def text_config(shapes: Shapes, *, open_clip: bool) -> dict[str, Any]:
     }
 
 
-def _unwrapped(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _strip_wrapper(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix("text_model."): tensor for name, tensor in state.items()}
 
 
-def open_clip_as_clip(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """OpenCLIP's text encoder under transformers' names, without its last layer, which SD 2.x skips."""
+def convert_open_clip(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """OpenCLIP's text encoder with transformers' names, without its last layer, which SD 2.x does not use."""
     last = _highest(state, r"transformer\.resblocks\.(\d+)\.")
-    named = {
+    renamed = {
         "embeddings.token_embedding.weight": state["token_embedding.weight"],
         "embeddings.position_embedding.weight": state["positional_embedding"],
         "final_layer_norm.weight": state["ln_final.weight"],
@@ -204,18 +204,18 @@ def open_clip_as_clip(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
     for name, tensor in state.items():
         if (found := re.match(r"transformer\.resblocks\.(\d+)\.(.+)\.?(weight|bias)$", name)) and int(found[1]) < last:
-            named |= _layer_names(f"encoder.layers.{found[1]}", found[2].rstrip("._"), found[3], tensor)
-    return named
+            renamed |= _rename_layer(f"encoder.layers.{found[1]}", found[2].rstrip("._"), found[3], tensor)
+    return renamed
 
 
-def _layer_names(layer: str, part: str, kind: str, tensor: Tensor) -> dict[str, Tensor]:
+def _rename_layer(layer: str, part: str, kind: str, tensor: Tensor) -> dict[str, Tensor]:
     if part == "attn.in_proj":
         return {f"{layer}.self_attn.{x}_proj.{kind}": t for x, t in zip("qkv", tensor.chunk(3), strict=True)}
     return {f"{layer}.{_OPEN_CLIP_NAMES[part]}.{kind}": tensor}
 
 
 def _highest(names: Mapping[str, Any], pattern: str) -> int:
-    """The highest number a pattern finds in the names. Raises KeyError(pattern) when it finds none."""
+    """The highest number that a pattern matches in the names. Raises KeyError(pattern) without a match."""
     found = [int(match[1]) for name in names if (match := re.match(pattern, name))]
     if not found:
         raise KeyError(pattern)

@@ -1,4 +1,4 @@
-"""Where the weights of Stable Diffusion lie: a hub id, a diffusers folder or one .safetensors file, never pickled."""
+"""Weights of Stable Diffusion at a hub id, in a diffusers folder or in one .safetensors file; never pickled."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from pipeline.io.checkpoints import is_local, sweep_hint
 
 
 class Weights(Protocol):
-    """A place that holds a Stable Diffusion model. ``files``: all that is read from it, by name."""
+    """A Stable Diffusion model on disk. The models that it loads are on the CPU."""
 
     @property
     def files(self) -> dict[str, Path]:
-        """The files whose bytes decide the features."""
+        """The files whose bytes determine the features, by name."""
         ...
 
     def read_configs(self) -> DiffusionConfigs:
         """Configs, checked to be Stable Diffusion 1.x or 2.x. Raises BadInput."""
         ...
 
-    def unet(self, dtype: torch.dtype) -> nn.Module:
+    def load_unet(self, dtype: torch.dtype) -> nn.Module:
         """The U-Net. Raises BadInput for weights that do not fit the config."""
         ...
 
-    def vae(self, dtype: torch.dtype) -> nn.Module:
-        """The VAE, its decoder dropped. Raises BadInput as ``unet`` does."""
+    def load_vae(self, dtype: torch.dtype) -> nn.Module:
+        """The VAE without its decoder. Raises BadInput as ``load_unet``."""
         ...
 
-    def prompt(self, text: str) -> Float[Tensor, "1 l d"]:
-        """The text encoder's last hidden state, float32; the encoder is freed. Raises BadInput as ``unet`` does."""
+    def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+        """The text encoder's last hidden state, float32; frees the encoder. Raises BadInput as ``load_unet``."""
         ...
 
 
 def open_weights(weights: str, revision: str | None) -> Weights:
-    """What lies at a hub id, in a diffusers folder, or in one .safetensors file of the original layout."""
+    """Locate weights at a hub id, in a diffusers folder, or in one .safetensors file in the original layout."""
     if not is_local(weights):
         return DiffusersFolder(download(weights, revision))
     path = Path(weights).expanduser()

@@ -1,1 +1,1 @@
-"""Vision transformers of the transformers library: their features, and the folder their weights come from."""
+"""Vision transformers of the transformers library: their features, and the folder with their weights."""

@@ -1,18 +1,17 @@
-"""crops -> feature maps of a self-supervised vision transformer, whatever its weights.
+"""crops -> feature maps of a self-supervised vision transformer: the base of such extractors.
 
-Amir et al., ECCVW 2022 (Deep ViT Features as Dense Visual Descriptors): what the attention of a block compares, or the
-tokens themselves, as a map of descriptors; patches that overlap for finer maps; bins around each cell for context.
+Amir et al., ECCVW 2022 (Deep ViT Features as Dense Visual Descriptors): keys, queries, values or tokens of a block as a
+map of descriptors; overlapping patches for finer maps; spatial bins around each cell for context.
 
-Where a token lies: the crop gets (patch - stride) / 2 black pixels on each side, so that token (i, j) looks at a patch
-centred on cell (i, j) of input_size / stride equal cells that cover the whole crop, as ``camera.cell_to_px`` has it for
-every map. Amir et al. do not pad; their tokens lie half a patch from the border and a stride apart, and a map of equal
-cells would misplace them by up to (patch - stride) / 2 pixels.
+Position of a token: the crop is padded with (patch - stride) / 2 black pixels on each side, so that the patch of token
+(i, j) is centred on cell (i, j) of the input_size / stride equal cells that cover the crop, the convention of
+``camera.cell_to_px``. Amir et al. do not pad: their first token lies half a patch from the border, and a map of equal
+cells would misplace tokens by up to (patch - stride) / 2 pixels.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
@@ -24,6 +23,7 @@ from torch import Tensor, nn
 
 from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
 from pipeline.backbones.determinism import use_deterministic_convolutions
+from pipeline.backbones.extractor import Extractor
 from pipeline.backbones.stable_diffusion.features import to_network_image
 from pipeline.backbones.vit.source import TransformersFolder, VitSizes, open_folder
 from pipeline.backbones.vit.transformer import Facet, embed_patches, pad_border, read_block_tokens, standardise
@@ -33,27 +33,24 @@ from pipeline.io.checkpoints import tensor_shapes
 from pipeline.io.digests import files_digest
 from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Dtype, NonNegative, Positive, Runtime, Spec, spec
+from pipeline.spec import Dtype, NonNegative, Positive, Runtime, spec
 
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
-_LIVE_MAPS = 24  # maps as wide as the model that are alive at once in a block: projections, attention, its MLP
+_LIVE_MAPS = 24  # maps of the model's width that are in memory at once in a block: projections, attention, MLP
 
 
 @spec
-class VitFeatures(Spec, ABC):
-    """The parameters that the transformers share. Layers are the numbers of their blocks, from 0.
+class VitFeatures(Extractor):
+    """Base of all transformer extractors, with their common parameters. Layer k is block k, from 0.
 
-    ``weights``: a hub id (``revision`` is for it alone) or a folder as save_pretrained writes it; the digest of the
-    files found there stands for both in the recipe. ``stride`` (px of the input, None: the patch size) divides the
-    patch size. Layers in ``binned`` have 1 + 8 ``hierarchy`` spatial bins in a cell (``functional.binning``).
-    ``norm_last``: tokens (not keys, queries or values) pass the model's last layer norm, whichever block they are of.
-    ``saliency_heads``: of the last block, whose attention makes SALIENCY_LAYER (1 h w); None: all.
-    CLASS_TOKEN_LAYER (c 1 1) is the class token behind the last layer norm.
+    ``weights``: a hub id (with an optional ``revision``) or a folder written by save_pretrained; the recipe holds the
+    digest of the files instead of these two fields. ``stride``: px of the input from one token to the next, a divisor
+    of the patch size; None: the patch size. ``binned``: layers whose cells have 1 + 8 ``hierarchy`` spatial bins
+    (``functional.binning``). ``norm_last``: tokens of any block (not keys, queries or values) go through the model's
+    last layer norm. ``saliency_heads``: heads of the last block whose attention gives SALIENCY_LAYER (1 h w), None for
+    all. CLASS_TOKEN_LAYER (c 1 1) is the class token after the last layer norm.
     """
 
-    needs_geometry: ClassVar[bool] = False
-    notice: ClassVar[str] = ""
-    timestep: ClassVar[int] = 0
     model_types: ClassVar[tuple[str, ...]]
 
     weights: str
@@ -69,18 +66,18 @@ class VitFeatures(Spec, ABC):
 
     @cached_property
     def source(self) -> TransformersFolder:
-        """The weights, found (and fetched, for a hub id). Raises BadInput."""
+        """Where the weights are; a hub id is downloaded first. Raises BadInput."""
         return open_folder(self.weights, self.revision, self.model_types, self.kind.partition(".")[2])
 
     @cached_property
     def sizes(self) -> VitSizes:
-        """Sizes from the config alone. Raises BadInput for weights of another class."""
+        """Sizes from the config; no weights are loaded. Raises BadInput for weights of another class."""
         return self.source.read_sizes()
 
     @cached_property
     def weights_digest(self) -> str:
-        """sha256 of all files the features depend on. Raises BadInput."""
-        _ = self.sizes  # first: a folder of another class is refused for what it is
+        """sha256 of all files that the features depend on. Raises BadInput."""
+        _ = self.sizes  # checked first, so that a folder of another class is refused by its class
         return files_digest(self.source.files)
 
     @property
@@ -94,7 +91,7 @@ class VitFeatures(Spec, ABC):
         return self.stride or self.sizes.patch
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe; the weights by digest, the stride in pixels, and nothing that cannot matter."""
+        """As Spec.recipe, with the weights' digest and the stride in pixels; fields without effect get fixed values."""
         recipe = super().recipe() | {"weights": self.weights_digest, "stride": self.stride_px}
         del recipe["revision"]
         recipe["hierarchy"] = self.hierarchy if self.binned else 0
@@ -116,17 +113,17 @@ class VitFeatures(Spec, ABC):
         """Weights into memory. Raises BadInput for weights that are missing or of another class."""
         _check(self, ())
         device = torch.device(runtime.torch_device())
-        model = self.source.model(getattr(torch, self.dtype)).eval().requires_grad_(False).to(device)
-        batch = runtime.batch or compute_batch_size(_working(self, device.type), runtime, device)
+        model = self.source.load_model(getattr(torch, self.dtype)).eval().requires_grad_(False).to(device)
+        batch = runtime.batch or compute_batch_size(_pass_footprint(self, device.type), runtime, device)
         return VitBackbone(self, model, device, batch)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
-        """As fitting.Sized: the weights are counted in the headers of their files."""
+        """As Extractor.footprint; weights are counted from the headers of their files."""
         paths = [path for path in self.source.files.values() if path.suffix == ".safetensors"]
         values = sum(math.prod(shape) for path in paths for shape in tensor_shapes(path).values())
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
         return Footprint(
-            values * _bytes_per_value(self), 0, _working(self, device).bytes_per_crop + maps, _MOST_CROPS[device]
+            values * _bytes_per_value(self), 0, _pass_footprint(self, device).bytes_per_crop + maps, _MOST_CROPS[device]
         )
 
 
@@ -137,10 +134,10 @@ class VitBackbone:
         self.spec, self.model, self.device, self.batch = spec, model, device, batch
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        """Maps of the given layers in the spec's dtype, on the model's device; at most ``batch`` crops at a time."""
+        """Maps of the given layers in the spec's dtype, on the model's device, computed ``batch`` crops at a time."""
         _check(self.spec, layers)
         chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
-        # concatenated outside inference mode: the maps are ordinary tensors again, free for use in place
+        # outside inference mode, so that the result is an ordinary tensor that may be changed in place
         return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
 
     @torch.inference_mode()
@@ -159,12 +156,12 @@ class VitBackbone:
             return {layer: self._map(tokens, layer) for layer, tokens in found.items()}
 
     def _image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
-        """What the patches are cut from: the crops at ``input_size``, padded and standardised."""
+        """The image that patches are cut from: the crops at ``input_size``, padded and standardised."""
         s = self.spec
         rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
         image = (to_network_image(rgb, size=s.input_size) + 1) / 2
-        framed_image = pad_border(image, overhang=s.sizes.patch - s.stride_px)
-        return standardise(framed_image).to(getattr(torch, s.dtype))
+        padded = pad_border(image, overhang=s.sizes.patch - s.stride_px)
+        return standardise(padded).to(getattr(torch, s.dtype))
 
     def _map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
         side = 1 if layer == CLASS_TOKEN_LAYER else self.spec.input_size // self.spec.stride_px
@@ -187,8 +184,8 @@ def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
         raise BadInput("extract.stride", found=spec.stride, needed=f"a divisor of the patch size {a.patch}: {divisors}")
     if spec.input_size % spec.stride_px:
         raise BadInput("extract.input_size", found=spec.input_size, needed=f"a multiple of the stride {spec.stride_px}")
-    if strange := [layer for layer in spec.binned if layer > last]:
-        raise BadInput("extract.binned", found=strange[0], needed=f"0..{last}, the transformer's {a.depth} blocks")
+    if unknown := [layer for layer in spec.binned if layer > last]:
+        raise BadInput("extract.binned", found=unknown[0], needed=f"0..{last}, the transformer's {a.depth} blocks")
     if SALIENCY_LAYER in layers and (not _heads(spec) or max(_heads(spec)) >= a.heads):
         found, needed = list(_heads(spec)), f"some of 0..{a.heads - 1}, the {a.heads} heads of the last block"
         raise BadInput("extract.saliency_heads", found=found, needed=needed)
@@ -198,8 +195,8 @@ def _bytes_per_value(spec: VitFeatures) -> int:
     return 4 if spec.dtype == "float32" else 2
 
 
-def _working(spec: VitFeatures, device: str) -> Footprint:
-    """A pass by what is alive within a block and the widest map that is kept."""
+def _pass_footprint(spec: VitFeatures, device: str) -> Footprint:
+    """Estimate of a pass from the maps in memory within a block and the widest map that is returned."""
     cells = (spec.input_size // spec.stride_px) ** 2
     maps = _LIVE_MAPS + 2 * len(set(spec.binned)) * bin_count(spec.hierarchy)
     return Footprint(0, 0, maps * spec.sizes.width * cells * _bytes_per_value(spec), _MOST_CROPS[device])

@@ -1,4 +1,4 @@
-"""Weights of a vision transformer as transformers saves them: found, checked, loaded. safetensors only."""
+"""A vision transformer in a transformers folder, located, checked and loaded. Only safetensors are read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLASSES = {
     "dinov2": "Dinov2Model",
     "dinov2_with_registers": "Dinov2WithRegistersModel",
 }
-"""model_type of a config -> the class of transformers that has the bare backbone."""
+"""model_type of a config -> the transformers class of the backbone without a head."""
 
 _INDEX, _SINGLE = "model.safetensors.index.json", "model.safetensors"
 _PATTERNS = ["config.json", _INDEX, _SINGLE, "model-[0-9]*-of-[0-9]*.safetensors"]
@@ -27,7 +27,7 @@ _PATTERNS = ["config.json", _INDEX, _SINGLE, "model-[0-9]*-of-[0-9]*.safetensors
 
 @dataclass(frozen=True)
 class VitSizes:
-    """What is known of a transformer before its weights. ``patch``: side in pixels; ``registers``: tokens beside."""
+    """Sizes of a transformer. ``patch``: side of a patch in pixels; ``registers``: number of register tokens."""
 
     width: int
     depth: int
@@ -37,7 +37,7 @@ class VitSizes:
 
 
 def open_folder(weights: str, revision: str | None, model_types: tuple[str, ...], name: str) -> TransformersFolder:
-    """What lies at a hub id or in a local folder. Raises BadInput; ``name``: that of the field below ``weights``."""
+    """Locate weights at a hub id or in a folder. ``name``: the model's field in ``weights``. Raises BadInput."""
     if not is_local(weights):
         return TransformersFolder(fetch_snapshot(weights, revision, _PATTERNS, field=FIELD, name=name), model_types)
     path = Path(weights).expanduser()
@@ -50,19 +50,19 @@ def open_folder(weights: str, revision: str | None, model_types: tuple[str, ...]
 
 @dataclass(frozen=True)
 class TransformersFolder:
-    """A folder as transformers' save_pretrained writes it, with a model of one of ``model_types``."""
+    """A folder written by transformers' save_pretrained, with a model of one of ``model_types``."""
 
     root: Path
     model_types: tuple[str, ...]
 
     @property
     def files(self) -> dict[str, Path]:
-        """The files whose bytes decide the features, by name."""
-        return {path.name: path for path in (self._json, *self._tensors())}
+        """The files whose bytes determine the features, by name."""
+        return {path.name: path for path in (self._json, *self._list_tensors())}
 
     def read_sizes(self) -> VitSizes:
         """Sizes from the config. Raises BadInput for a model of another class."""
-        config = self._config()
+        config = self._read_config()
         registers = getattr(config, "num_register_tokens", 0)
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "patch_size", "image_size"):
             size = getattr(config, name)
@@ -72,18 +72,18 @@ class TransformersFolder:
             config.hidden_size, config.num_hidden_layers, config.num_attention_heads, config.patch_size, registers
         )
 
-    def model(self, dtype: torch.dtype) -> nn.Module:
-        """The backbone. Raises BadInput for weights that are missing or do not fit the config."""
-        self._config()
-        tensors = [path for path in self._tensors() if path.suffix == ".safetensors"]
-        options = {"add_pooling_layer": False} if self._model_type() == "vit" else {}
-        return load_pretrained(CLASSES[self._model_type()], self.root, tensors, **options).to(dtype)
+    def load_model(self, dtype: torch.dtype) -> nn.Module:
+        """The backbone, on the CPU. Raises BadInput for weights that are missing or do not fit the config."""
+        self._read_config()
+        tensors = [path for path in self._list_tensors() if path.suffix == ".safetensors"]
+        options = {"add_pooling_layer": False} if self._read_model_type() == "vit" else {}
+        return load_pretrained(CLASSES[self._read_model_type()], self.root, tensors, **options).to(dtype)
 
     @property
     def _json(self) -> Path:
         return self.root / "config.json"
 
-    def _model_type(self) -> str:
+    def _read_model_type(self) -> str:
         """Raises BadInput for a config of another class."""
         needed = f"a {' or '.join(CLASSES[name] for name in self.model_types)} of transformers"
         if not self._json.exists():
@@ -98,18 +98,18 @@ class TransformersFolder:
             raise BadInput(self._json, found=f"{named} (model_type {model_type})", needed=needed)
         return str(model_type)
 
-    def _config(self) -> Any:
+    def _read_config(self) -> Any:
         import transformers
 
-        cls: Any = getattr(transformers, CLASSES[self._model_type()].removesuffix("Model") + "Config")
+        cls: Any = getattr(transformers, CLASSES[self._read_model_type()].removesuffix("Model") + "Config")
         try:
             with silence_libraries():
                 return cls.from_dict(read_json(self._json))
-        except Exception as error:  # what a wrong value raises differs between versions of the library
+        except Exception as error:  # the type for a wrong value differs between versions of transformers
             raise BadInput(self._json, found=full_text(error), needed=f"the fields of a {cls.__name__}") from None
 
-    def _tensors(self) -> list[Path]:
-        """One file of weights, or an index and its shards."""
+    def _list_tensors(self) -> list[Path]:
+        """One weight file, or an index and its shards."""
         if (self.root / _SINGLE).exists():
             return [self.root / _SINGLE]
         if (self.root / _INDEX).exists():

@@ -1,6 +1,6 @@
-"""A vision transformer of the transformers library: images -> tokens -> maps by block, and no block past the deepest.
+"""A vision transformer of the transformers library: images -> tokens -> maps of blocks, up to the deepest one needed.
 
-The library's parts are found by their roles, since their names differ between its versions.
+Submodules are looked up by any of their known names, because transformers renames them between versions.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ _FIRST_NORM = ("norm1", "layernorm_before")
 
 
 def standardise(image: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
-    """Images in [0, 1] as DINO and DINOv2 were trained on them: ImageNet's mean and standard deviation."""
+    """Normalise images in [0, 1] by ImageNet's mean and standard deviation, as DINO and DINOv2 were trained."""
     mean, std = (torch.tensor(v, device=image.device).view(3, 1, 1) for v in (_IMAGENET_MEAN, _IMAGENET_STD))
     return (image - mean) / std
 
 
 def pad_border(image: Float[Tensor, "n 3 S S"], *, overhang: int) -> Float[Tensor, "n 3 R R"]:
-    """Images with half of ``overhang`` more pixels on each side, black as the crop stage has it outside the image.
+    """Pad images with ``overhang`` / 2 black pixels on each side, the colour that crops have outside the image.
 
-    Half an odd number: black all the same, and the image half a pixel off, bilinear.
+    If ``overhang`` is odd, the image is shifted by half a pixel with bilinear interpolation.
     """
     image = pad(image, ((overhang + 1) // 2,) * 4)
     return avg_pool2d(image, 2, stride=1) if overhang % 2 else image
 
 
 def embed_patches(model: Any, image: Float[Tensor, "n 3 S S"], *, stride: int) -> Float[Tensor, "n t c"]:
-    """Class token, registers where there are any, and the tokens of all patches, rows first, with their positions.
+    """Class token, registers if the model has any, and patch tokens in row-major order, with position embeddings.
 
-    A patch every ``stride`` pixels, so that patches overlap when it is smaller than they are (Amir et al., ECCVW 2022).
+    Patches overlap where ``stride`` (px) is smaller than a patch (Amir et al., ECCVW 2022).
     """
     parts = model.embeddings
     kernel = parts.patch_embeddings.projection
@@ -54,9 +54,9 @@ def embed_patches(model: Any, image: Float[Tensor, "n 3 S S"], *, stride: int) -
 
 
 def resize_positions(positions: Float[Tensor, "1 p c"], *, cells: int, antialias: bool) -> Float[Tensor, "1 t c"]:
-    """Position embeddings of ``cells`` x ``cells`` tokens: bicubic, grid edges on grid edges, in float32.
+    """Position embeddings of ``cells`` x ``cells`` tokens: bicubic in float32, edges of both grids aligned.
 
-    ``antialias`` when shrinking, as DINOv2 was trained with registers (Darcet et al., ICLR 2024) and not without.
+    ``antialias``: when shrinking; DINOv2 was trained so with registers (Darcet et al., ICLR 2024), but not without.
     """
     side = round(positions.shape[1] ** 0.5)
     if side == cells:
@@ -76,10 +76,10 @@ def read_block_tokens(
     saliency_heads: Sequence[int],
     skipped: int,
 ) -> dict[int, Float[Tensor, "n _t _c"]]:
-    """Tokens of the given blocks, the ``skipped`` first ones (class token, registers) left out.
+    """Tokens of the given blocks without the first ``skipped`` ones (class token, registers).
 
-    Queries, keys and values are those of the block's attention, all heads side by side; "token" is its output, behind
-    the model's last norm if ``norm_last``. The pseudo-layers give the class token (n 1 c) and its attention (n t 1).
+    Queries, keys and values are those of the block's attention, with all heads concatenated; "token" is the block's
+    output, after the model's last norm if ``norm_last``. Pseudo-layers: the class token (n 1 c), its attention (n t 1).
     """
     blocks = find_blocks(model)
     last = len(blocks) - 1
@@ -89,7 +89,7 @@ def read_block_tokens(
         if layer in layers and facet != "token":
             found[layer] = project_facet(block, tokens, facet)[:, skipped:]
         if layer == last and SALIENCY_LAYER in layers:
-            found[SALIENCY_LAYER] = saliency(block, tokens, heads=saliency_heads, model=model, skipped=skipped)
+            found[SALIENCY_LAYER] = class_attention(block, tokens, heads=saliency_heads, model=model, skipped=skipped)
         if layer == deepest and CLASS_TOKEN_LAYER not in layers and not (layer in layers and facet == "token"):
             break
         output = block(tokens)
@@ -102,32 +102,32 @@ def read_block_tokens(
 
 
 def find_blocks(model: nn.Module) -> nn.ModuleList:
-    """The transformer's blocks, its only list of modules."""
+    """The transformer's blocks: its only ModuleList."""
     return next(module for module in model.modules() if isinstance(module, nn.ModuleList))
 
 
 def project_facet(block: nn.Module, tokens: Float[Tensor, "n t c"], facet: str) -> Float[Tensor, "n t c"]:
-    """Queries, keys or values of a block's attention, from the tokens that enter the block."""
-    return part(block, _PROJECTIONS[facet])(part(block, _FIRST_NORM)(tokens))
+    """Queries, keys or values of a block's attention, computed from the block's input tokens."""
+    return find_submodule(block, _PROJECTIONS[facet])(find_submodule(block, _FIRST_NORM)(tokens))
 
 
-def saliency(
+def class_attention(
     block: nn.Module, tokens: Float[Tensor, "n t c"], *, heads: Sequence[int], model: Any, skipped: int
 ) -> Float[Tensor, "n p 1"]:
-    """The class token's attention to every patch, mean of ``heads``, from 0 (least) to 1 (most) in each image.
+    """Saliency: the class token's attention to every patch, averaged over ``heads``, scaled to [0, 1] in each image.
 
-    Amir et al., ECCVW 2022, and their code. An image that is the same everywhere gives 0.
+    Amir et al., ECCVW 2022, and their code. A uniform image gives 0.
     """
     count = model.config.num_attention_heads
     query = project_facet(block, tokens[:, :1], "query").unflatten(-1, (count, -1))
     key = project_facet(block, tokens, "key").unflatten(-1, (count, -1))
     scores = torch.einsum("nshd,nthd->nht", query.float(), key.float()) * key.shape[-1] ** -0.5
-    seen = scores.softmax(-1)[:, list(heads), skipped:].mean(1)
-    least, most = seen.amin(1, keepdim=True), seen.amax(1, keepdim=True)
-    relative = (seen - least) / (most - least).clamp_min(torch.finfo(torch.float32).tiny)
+    attention = scores.softmax(-1)[:, list(heads), skipped:].mean(1)
+    low, high = attention.amin(1, keepdim=True), attention.amax(1, keepdim=True)
+    relative = (attention - low) / (high - low).clamp_min(torch.finfo(torch.float32).tiny)
     return relative[..., None].to(tokens.dtype)
 
 
-def part(block: nn.Module, names: Collection[str]) -> nn.Module:
-    """The part of a block that has one of the names."""
+def find_submodule(block: nn.Module, names: Collection[str]) -> nn.Module:
+    """The submodule of a block that has one of the names."""
     return next(module for path, module in block.named_modules() if path.rpartition(".")[2] in names)

@@ -1,4 +1,4 @@
-"""image, mask or box -> square crop around the object, background removed."""
+"""image, mask or box -> square crop around the object with the background removed."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from pydantic import Field
 from pipeline.functional.camera import square_crop
 from pipeline.functional.resample import resample
 from pipeline.items.views import Crop
-from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.crop import HALF, BBox, locate_object
+from pipeline.spec import Positive, spec
+from pipeline.stages.crop import HALF, BBox, Cropper, locate_object
 
 
 @spec
-class Square(Spec):
+class Square(Cropper):
     """A square around the mask's box, or around the given box where there is no mask.
 
-    ``padding_ratio``: side of the square over the box's longer side. ``background``: ``remove`` blackens what the mask
-    leaves out before resampling, so that none of it bleeds into the crop; ``keep`` leaves it. Outside the image the
-    crop is black and no mask; the square never moves.
+    ``padding_ratio``: side of the square over the longer side of the box. ``background``: ``remove`` blackens pixels
+    outside the mask before resampling, so that they do not bleed into the crop; ``keep`` leaves them. Outside the image
+    the crop is black and not part of the mask; the square is not moved to fit into the image.
     """
 
     kind: ClassVar[str] = "crop.square"
     version: ClassVar[int] = 1
-    needs_camera: ClassVar[bool] = False
 
     size: Positive = 128
     padding_ratio: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.2

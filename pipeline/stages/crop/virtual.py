@@ -1,4 +1,4 @@
-"""image, mask or box, K -> what a camera that is turned towards the object would see, background removed."""
+"""image, mask or box, K -> the view of a virtual camera that is turned towards the object, background removed."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from pipeline.errors import NoPose
 from pipeline.functional.camera import virtual_crop
 from pipeline.functional.resample import warp
 from pipeline.items.views import Crop
-from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.crop import HALF, BBox, format_box, locate_object
+from pipeline.spec import Positive, spec
+from pipeline.stages.crop import HALF, BBox, Cropper, format_box, locate_object
 
 
 @spec
-class Virtual(Spec):
-    """The picture of a virtual pinhole camera (Örnek et al., "FoundPose", ECCV 2024, section 3.2).
+class Virtual(Cropper):
+    """The image of a virtual pinhole camera (Örnek et al., "FoundPose", ECCV 2024, section 3.2).
 
-    Its optical axis goes through the centre of the mask's box, or of the given box where there is no mask; its focal
-    length lets the square around the box just fit, whose side is ``padding_ratio`` times the box's longer side. An
-    object at the image's border then looks as a template does, whose camera looks straight at it. Departures from the
-    released code: the axis goes through the box's centre, there through the mean of the rays to its corners; there 1.2
-    is the padding of a sphere through the corners, which is 1.2 sqrt(2) = 1.697 here. ``background``: ``remove``
-    blackens what the mask leaves out before warping; ``keep`` leaves it. Outside the image the crop is black and no
-    mask.
+    Its optical axis goes through the centre of the mask's box, or of the given box where there is no mask. Its focal
+    length makes the square around the box, with a side of ``padding_ratio`` times the box's longer side, just fit. An
+    object at the image's border is then seen straight on, as in a template.
+
+    ``background``: ``remove`` blackens pixels outside the mask before warping; ``keep`` leaves them. Outside the image
+    the crop is black and not part of the mask.
+
+    Differences to the released code: its axis goes through the mean of the rays to the box's corners, and its padding
+    of 1.2 refers to a sphere through the corners, which is 1.2 sqrt(2) = 1.697 here.
     """
 
     kind: ClassVar[str] = "crop.virtual"
@@ -54,5 +56,5 @@ class Virtual(Spec):
         except ValueError as reason:
             raise NoPose("crop", f"box {format_box(box)} with this K: {reason}") from None
         shown = rgb * area[..., None] if self.background == "remove" else rgb
-        both = warp(np.dstack([shown, area]), A_crop_img, size=self.size)
-        return Crop(np.rint(both[..., :3]).clip(0, 255).astype(np.uint8), both[..., 3] >= HALF, A_crop_img)
+        warped = warp(np.dstack([shown, area]), A_crop_img, size=self.size)
+        return Crop(np.rint(warped[..., :3]).clip(0, 255).astype(np.uint8), warped[..., 3] >= HALF, A_crop_img)

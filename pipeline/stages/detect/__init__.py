@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from pipeline.backbones.extractor import Extractor
 from pipeline.bop.dataset import Dataset
 from pipeline.items.views import Detection, Proposal, Target
-from pipeline.spec import Variant
+from pipeline.spec import Spec
 from pipeline.stages.detect.proposals import Proposer
 
 
@@ -43,24 +43,23 @@ class Descriptors:
     of_image: Callable[[tuple[int, int]], ImageDescriptors]
 
 
-class Detector(Variant, Protocol):
-    """Contract of every detect variant.
-
-    ``describer``: None for a variant that reads its detections from files. Otherwise the graph computes and caches the
-    descriptors it defines, and passes them to the call.
-    """
+class Detector(Spec, ABC):
+    """Contract of a detect variant, which reads its detections from files or compares descriptors."""
 
     @property
     def describer(self) -> Describer | None:
-        """See the class."""
-        ...
+        """What to describe proposals and templates by: the graph computes descriptors and passes them to the call."""
+        return None
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """Files whose bytes determine the detections (they enter the key); not asked of a variant with a describer."""
-        ...
+        """Files whose bytes determine the detections; they enter the key."""
+        return []
 
+    @abstractmethod
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
-        """Detections of the targets' objects in the targets' images, best score first within image and object."""
-        ...
+        """Detections of the targets' objects in the targets' images, best score first within image and object.
+
+        ``descriptors``: those of ``describer``; None without one.
+        """

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import ClassVar, Literal, cast
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -18,14 +17,14 @@ from pipeline.functional.boxes import non_maximum_suppression
 from pipeline.functional.descriptors import mean_top_cosine
 from pipeline.items.features import CLASS_TOKEN_LAYER
 from pipeline.items.views import Detection, Proposal, Target
-from pipeline.spec import Fraction, Positive, Spec, spec
-from pipeline.stages.detect import Describer, Descriptors, ImageDescriptors
+from pipeline.spec import Fraction, Positive, spec
+from pipeline.stages.detect import Describer, Descriptors, Detector, ImageDescriptors
 from pipeline.stages.detect.proposals import Proposer
 from pipeline.stages.detect.proposals.sam import Sam
 
 
 @spec
-class Cnos(Spec):
+class Cnos(Detector):
     """Every proposal goes to the object of the run whose templates it looks most like, if it looks like it enough.
 
     ``describe``: the extract variant that describes proposals and templates; ``describe_layer``: its class token (-2),
@@ -40,7 +39,7 @@ class Cnos(Spec):
     kind: ClassVar[str] = "detect.cnos"
     version: ClassVar[int] = 1
 
-    describe: Spec
+    describe: Extractor
     proposals: Proposer = field(default_factory=Sam)
     describe_layer: int = CLASS_TOKEN_LAYER
     best: Positive = 5
@@ -52,11 +51,7 @@ class Cnos(Spec):
     @property
     def describer(self) -> Describer:
         """``describe``, ``describe_layer`` and ``proposals``."""
-        return Describer(self.proposals, cast(Extractor, self.describe), self.describe_layer)
-
-    def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """None: detections depend on the descriptors, whose keys the graph knows."""
-        return []
+        return Describer(self.proposals, self.describe, self.describe_layer)
 
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None

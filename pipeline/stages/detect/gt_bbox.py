@@ -11,13 +11,13 @@ from pipeline.bop.jsonio import describe_place
 from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.items.views import Detection, Target
-from pipeline.spec import Spec, spec
-from pipeline.stages.detect import Descriptors
+from pipeline.spec import spec
+from pipeline.stages.detect import Descriptors, Detector
 from pipeline.stages.detect.annotated import annotation_paths, select_instances
 
 
 @spec
-class GtBbox(Spec):
+class GtBbox(Detector):
     """Boxes of annotated instances, score 1, the ``inst_count`` most visible of each target.
 
     ``bbox``: around the visible part, or around the whole silhouette, which may leave the image. An instance
@@ -26,7 +26,6 @@ class GtBbox(Spec):
 
     kind: ClassVar[str] = "detect.gt_bbox"
     version: ClassVar[int] = 1
-    describer: ClassVar[None] = None
 
     bbox: Literal["visib", "obj"] = "visib"
 

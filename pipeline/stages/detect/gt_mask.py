@@ -12,13 +12,13 @@ from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Detection, Target
-from pipeline.spec import Spec, spec
-from pipeline.stages.detect import Descriptors
+from pipeline.spec import spec
+from pipeline.stages.detect import Descriptors, Detector
 from pipeline.stages.detect.annotated import annotation_paths, image_paths, select_instances
 
 
 @spec
-class GtMask(Spec):
+class GtMask(Detector):
     """Masks of annotated instances, score 1, the ``inst_count`` most visible of each target.
 
     ``visible``: the visible part (mask_visib/), otherwise the whole silhouette (mask/). A mask that is missing, broken,
@@ -27,7 +27,6 @@ class GtMask(Spec):
 
     kind: ClassVar[str] = "detect.gt_mask"
     version: ClassVar[int] = 1
-    describer: ClassVar[None] = None
 
     visible: bool = True
 

@@ -16,13 +16,13 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.io.digests import file_digest
 from pipeline.items.views import Detection, Target
-from pipeline.spec import Positive, Spec, spec
-from pipeline.stages.detect import Descriptors
+from pipeline.spec import Positive, spec
+from pipeline.stages.detect import Descriptors, Detector
 from pipeline.stages.detect.annotated import image_paths
 
 
 @spec
-class Json(Spec):
+class Json(Detector):
     """Detections in the json of BOP's and CNOS's default detections, plain or gzipped.
 
     A list of {scene_id, image_id, category_id, score, bbox [x, y, w, h], time, segmentation {size, counts}}; ``time``
@@ -34,7 +34,6 @@ class Json(Spec):
 
     kind: ClassVar[str] = "detect.json"
     version: ClassVar[int] = 1
-    describer: ClassVar[None] = None
 
     path: str = ""
     keep: Literal["inst_count", "all"] | Positive = "inst_count"

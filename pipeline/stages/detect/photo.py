@@ -13,17 +13,16 @@ from pipeline.bop.photo import Photo
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Detection, Target
-from pipeline.spec import Spec, spec
-from pipeline.stages.detect import Descriptors
+from pipeline.spec import spec
+from pipeline.stages.detect import Descriptors, Detector
 
 
 @spec
-class PhotoMask(Spec):
+class PhotoMask(Detector):
     """The mask or box that ``dataset=photo`` was given, with score 1."""
 
     kind: ClassVar[str] = "detect.photo"
     version: ClassVar[int] = 1
-    describer: ClassVar[None] = None
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """The photograph, and the mask if there is one."""

@@ -11,18 +11,19 @@ from jaxtyping import Bool, Float, Float32
 from pydantic import Field
 
 from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
-from pipeline.backbones.grid import CELLS, cells_of
+from pipeline.backbones.extractor import Extractor
+from pipeline.backbones.grid import CELLS, count_cells
 from pipeline.errors import BadInput
 from pipeline.functional import camera, rigid
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import NonNegative, PositiveFloat, Runtime, Spec, spec
+from pipeline.spec import NonNegative, PositiveFloat, Runtime, spec
 
 FINEST = max(CELLS.values())
 
 
 @spec
-class Coordinates(Spec):
+class Coordinates(Extractor):
     """Random Fourier features of the object point at each cell's centre; background cells are zero.
 
     The cosine of two cells d mm apart on the object is exp(-d^2 / (2 bandwidth_mm^2)) in expectation over the
@@ -36,7 +37,6 @@ class Coordinates(Spec):
     needs_geometry: ClassVar[bool] = True
     notice: ClassVar[str] = "oracle: features are the true object coordinates; the figures show geometry errors alone"
     model: ClassVar[str] = "coordinates"
-    timestep: ClassVar[int] = 0
 
     bandwidth_mm: PositiveFloat = 10.0
     channels: Annotated[int, Field(ge=2, multiple_of=2)] = 64
@@ -44,7 +44,7 @@ class Coordinates(Spec):
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
-        cells_of(layer)
+        count_cells(layer)
         return self.channels, FINEST, FINEST
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:

@@ -10,18 +10,18 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, Field, PlainValidator
 
 from pipeline.backbones.batching import Footprint, maps_bytes
-from pipeline.backbones.extractor import Backbone, Extractor, footprint_of
+from pipeline.backbones.extractor import Backbone, Extractor
 from pipeline.errors import BadInput
 from pipeline.functional.maps import concatenate_normalized
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Fraction, Runtime, Spec, spec
+from pipeline.spec import Fraction, Runtime, spec
 from pipeline.stages.extract.dinov2 import DinoV2
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
 
 def _check_extractor(value: Any) -> Any:
-    if not all(hasattr(type(value), name) for name in ("feature_shape", "load", "recipe")):
+    if not isinstance(value, Extractor):
         raise ValueError("an extract variant, chosen as extract@extract.first=hog")
     return value
 
@@ -37,7 +37,7 @@ LayerPairs = Annotated[tuple[tuple[int, int], ...], Field(min_length=1), AfterVa
 
 
 @spec
-class Fusion(Spec):
+class Fusion(Extractor):
     """Any two extractors; layer l concatenates layer l of the first with its partner layer of the second.
 
     ``layers``: the pairs of layers. The second's map is resampled to the cells of the first; both descriptors of a cell
@@ -119,8 +119,8 @@ class Fusion(Spec):
 
         None where either is unknown.
         """
-        first = footprint_of(self.first, layers, crop_size, device)
-        second = footprint_of(self.second, [self.partner(k) for k in layers], crop_size, device)
+        first = self.first.footprint(layers, crop_size, device)
+        second = self.second.footprint([self.partner(k) for k in layers], crop_size, device)
         if first is None or second is None:
             return None
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])

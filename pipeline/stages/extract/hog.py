@@ -11,17 +11,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
-from pipeline.backbones.grid import CELLS, cells_of
+from pipeline.backbones.extractor import Extractor
+from pipeline.backbones.grid import CELLS, count_cells
 from pipeline.functional.gradients import append_neighbours, cell_means, oriented_energy, smooth_histograms
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, Spec, spec
+from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, spec
 
 _CROP_PX = 256  # a batch is sized for crops of this side
 
 
 @spec
-class Hog(Spec):
+class Hog(Extractor):
     """Gradient histograms of each cell and its 8 neighbours, normalised by local energy.
 
     ``signed``: edges from dark to bright and from bright to dark fall into different bins. ``context_cells``: distance
@@ -31,10 +32,7 @@ class Hog(Spec):
 
     kind: ClassVar[str] = "extract.hog"
     version: ClassVar[int] = 1
-    needs_geometry: ClassVar[bool] = False
-    notice: ClassVar[str] = ""
     model: ClassVar[str] = "hog"
-    timestep: ClassVar[int] = 0
 
     orientations: Positive = 8
     signed: bool = True
@@ -49,7 +47,7 @@ class Hog(Spec):
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
-        return self.channels, cells_of(layer), cells_of(layer)
+        return self.channels, count_cells(layer), count_cells(layer)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As Extractor.footprint: gradients of three channels, energies by orientation, and maps with their context."""
@@ -72,7 +70,7 @@ class HogBackbone:
     @torch.no_grad()
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32."""
-        cells = {layer: cells_of(layer) for layer in layers}
+        cells = {layer: count_cells(layer) for layer in layers}
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for x in (crops.rgb, crops.mask))
         s = self.spec
         energy = oriented_energy(rgb, mask, orientations=s.orientations, signed=s.signed, silhouette=s.silhouette)

@@ -10,30 +10,28 @@ import torch
 from torch.nn.functional import interpolate, pixel_unshuffle
 
 from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
-from pipeline.backbones.grid import CELLS, cells_of
+from pipeline.backbones.extractor import Extractor
+from pipeline.backbones.grid import CELLS, count_cells
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
-from pipeline.spec import Positive, Runtime, Spec, spec
+from pipeline.spec import Positive, Runtime, spec
 
 _CROP_PX = 256  # a batch is sized for crops of this side
 
 
 @spec
-class Pixels(Spec):
+class Pixels(Extractor):
     """The ``side`` x ``side`` colours of each cell, in [-1, 1], neither learned nor invariant to anything."""
 
     kind: ClassVar[str] = "extract.pixels"
     version: ClassVar[int] = 1
-    needs_geometry: ClassVar[bool] = False
-    notice: ClassVar[str] = ""
     model: ClassVar[str] = "pixels"
-    timestep: ClassVar[int] = 0
 
     side: Positive = 2
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w). Raises BadInput for a layer other than 2, 5, 8, 11."""
-        return 3 * self.side**2, cells_of(layer), cells_of(layer)
+        return 3 * self.side**2, count_cells(layer), count_cells(layer)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As Extractor.footprint: the colours and the maps."""
@@ -57,7 +55,7 @@ class PixelsBackbone:
         """Maps of the given layers, float32; each colour is an average over its part of the cell."""
         rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
         image, side = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1, self.spec.side
-        return {layer: pixel_unshuffle(_resize(image, side * cells_of(layer)), side) for layer in layers}
+        return {layer: pixel_unshuffle(_resize(image, side * count_cells(layer)), side) for layer in layers}
 
 
 def _resize(image: torch.Tensor, size: int) -> torch.Tensor:

@@ -58,5 +58,5 @@ class StableDiffusion(DiffusionFeatures):
     def load_model(self) -> LoadedModel:
         """Weights on the CPU; the text encoder is freed before the U-Net is loaded, to keep peak memory low."""
         dtype = getattr(torch, self.dtype)
-        prompt = self.source.prompt(self.prompt).to(dtype)
-        return LoadedModel(self.source.unet(dtype), self.source.vae(dtype), prompt)
+        prompt = self.source.encode_prompt(self.prompt).to(dtype)
+        return LoadedModel(self.source.load_unet(dtype), self.source.load_vae(dtype), prompt)

@@ -11,11 +11,12 @@ from pydantic import Field
 from pipeline.functional.rigid import rigid
 from pipeline.functional.viewpoints import ViewpointSet, viewpoint_rotations
 from pipeline.items.objects import Mesh
-from pipeline.spec import Fraction, Spec, spec
+from pipeline.spec import Fraction, spec
+from pipeline.stages.render import Renderer
 
 
 @spec
-class RenderSpec(Spec):
+class RenderSpec(Renderer):
     """Where the cameras stand and how the light falls. Every field is explained in conf/render."""
 
     viewpoints: ViewpointSet = "fibonacci"

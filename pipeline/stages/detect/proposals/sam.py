@@ -80,7 +80,7 @@ class Sam(Proposer):
 
     def load(self, runtime: Runtime) -> LoadedSam:
         """See Proposer."""
-        return LoadedSam(self, self.source.model().to(runtime.torch_device()).eval(), runtime.batch)
+        return LoadedSam(self, self.source.load_model().to(runtime.torch_device()).eval(), runtime.batch)
 
 
 class LoadedSam:
