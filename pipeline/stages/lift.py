@@ -16,9 +16,9 @@ def lift(
     K: Float[np.ndarray, "3 3"],
     T_cam_obj: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "m 3"]:
-    """Object points (mm) seen at a template's crop pixels.
+    """Object points (mm) at a template's crop pixels (x, y).
 
-    On the exact ray of the pixel, at the depth of the nearest pixel; NaN where that depth is 0.
+    Each lies on the ray through its exact position, at the depth of the nearest pixel; NaN where that depth is 0.
     Raises ValueError for a point outside the depth map.
     """
     px = apply_homography(np.linalg.inv(A_crop_img), np.asarray(px_crop, dtype=np.float64))

@@ -19,7 +19,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.items.views import Image, Proposal
 from pipeline.spec import Runtime, build, digest
-from pipeline.stages.detect.proposals.sam import Sam, grid, stability
+from pipeline.stages.detect.proposals.sam import Sam, compute_stability, make_grid
 
 CPU = Runtime(device="cpu")
 ALL = {"points_per_side": 3, "min_iou": 0.0, "min_stability": 0.0, "nms_iou": 1.0, "min_box_size": 0.0}
@@ -96,7 +96,7 @@ def test_proposals_are_those_of_a_plain_loop_through_the_library(folder: Path):
 
 def test_input_is_resized_as_the_library_does(folder: Path):
     image = photograph(96, 160)
-    ours = Sam(weights=str(folder)).load(CPU).input(image.rgb)
+    ours = Sam(weights=str(folder)).load(CPU).prepare(image.rgb)
     assert (ours - library_input(folder, image)).abs().max() < 0.018  # Pillow rounds twice to 8 bit: 1 / 255 / 0.224
 
 
@@ -149,12 +149,12 @@ def test_key_follows_the_weights_not_their_place(sam1: Path, tmp_path: Path):
 
 
 def test_points_are_the_centres_of_equal_cells():
-    assert grid(2, (40, 80)).tolist() == [[20, 10], [60, 10], [20, 30], [60, 30]]
+    assert make_grid(2, (40, 80)).tolist() == [[20, 10], [60, 10], [20, 30], [60, 30]]
 
 
 def test_stability_is_the_overlap_of_two_thresholds():
     logits = torch.tensor([[[-2.0, -0.5, 0.5, 2.0]], [[-2.0, -2.0, -2.0, -2.0]]])
-    assert stability(logits, offset=1.0).tolist() == pytest.approx([1 / 3, 0.0])
+    assert compute_stability(logits, offset=1.0).tolist() == pytest.approx([1 / 3, 0.0])
 
 
 def test_weights_that_are_not_there_are_told(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""target -> its annotated instances and its files; what variants share."""
+"""target -> its annotated instances and files; shared by the detectors that read ground truth."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def select_instances(dataset: Dataset, target: Target) -> list[GroundTruth]:
 
 
 def annotation_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-    """scene_gt.json and, where it is there, scene_gt_info.json of the targets' scenes."""
+    """scene_gt.json and, where it exists, scene_gt_info.json of the targets' scenes."""
     folders = [dataset.scene(scene_id).folder for scene_id in sorted({target.scene_id for target in targets})]
     infos = [folder / "scene_gt_info.json" for folder in folders]
     return [folder / "scene_gt.json" for folder in folders] + [path for path in infos if path.exists()]
 
 
 def image_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-    """The targets' images; masks must have their size."""
+    """The targets' images, in whose size masks and boxes are checked."""
     return [dataset.image_path(*image) for image in sorted({(t.scene_id, t.im_id) for t in targets})]

@@ -25,15 +25,15 @@ from pipeline.stages.detect.proposals.sam import Sam
 
 @spec
 class Cnos(Detector):
-    """Every proposal goes to the object of the run whose templates it looks most like, if it looks like it enough.
+    """Assigns each proposal to the object whose templates it resembles most, if its score is high enough.
 
-    ``describe``: the extract variant that describes proposals and templates; ``describe_layer``: its class token (-2),
-    or a layer, averaged over the mask. A proposal's score for an object is the mean of its ``best`` highest cosines
-    with the object's templates; ``min_score``: it must exceed it. ``nms_iou``: of two boxes of one object that
-    overlap more the one of lower score goes. ``max_per_image``: detections of the targets' objects that an image keeps
-    at most. ``keep``: and of those each target, as in detect=json.
+    ``describe``: the extract variant for descriptors; ``describe_layer``: its class token (-2), or a layer that is
+    averaged over the mask. A proposal's score for an object is the mean of its ``best`` highest cosines with the
+    object's templates, and must exceed ``min_score``. ``nms_iou``: of two boxes of one object with a larger IoU, the
+    one with the lower score is dropped. ``max_per_image``: maximum number of detections of the targets' objects in an
+    image. ``keep``: maximum number per target, as in detect=json.
 
-    Departures from the paper: its templates are the route's, and crops are the route's crops.
+    Differences to the paper: templates and crops are those of the route.
     """
 
     kind: ClassVar[str] = "detect.cnos"
@@ -56,7 +56,7 @@ class Cnos(Detector):
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
-        """At least one detection of each target; where nothing was found it has a defect that says why."""
+        """At least one detection per target; if none was found, one whose ``defect`` says why."""
         assert descriptors is not None, "the graph computes descriptors for a detector with a describer"
         found: list[Detection] = []
         for image in sorted({(target.scene_id, target.im_id) for target in targets}):

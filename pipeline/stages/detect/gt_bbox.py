@@ -20,8 +20,8 @@ from pipeline.stages.detect.annotated import annotation_paths, select_instances
 class GtBbox(Detector):
     """Boxes of annotated instances, score 1, the ``inst_count`` most visible of each target.
 
-    ``bbox``: around the visible part, or around the whole silhouette, which may leave the image. An instance
-    without a box is a Detection with a defect.
+    ``bbox``: around the visible part, or around the full silhouette, which may extend beyond the image. An instance
+    without a box becomes a Detection with a defect.
     """
 
     kind: ClassVar[str] = "detect.gt_bbox"
@@ -43,10 +43,10 @@ class GtBbox(Detector):
                 raise BadInput(
                     describe_place(path, scene=scene_id), found="no such file", needed=f"bbox_{self.bbox} of instances"
                 )
-        return [self._detection(target, gt) for target in targets for gt in select_instances(dataset, target)]
+        return [self._read_detection(target, gt) for target in targets for gt in select_instances(dataset, target)]
 
-    def _detection(self, target: Target, gt: GroundTruth) -> Detection:
+    def _read_detection(self, target: Target, gt: GroundTruth) -> Detection:
         box = gt.bbox_visib_xyxy if self.bbox == "visib" else gt.bbox_obj_xyxy
         defect = None if box else f"bbox_{self.bbox} has no area"
-        at = target.scene_id, target.im_id, target.obj_id
-        return Detection(*at, 1.0, 0.0, box or (0.0, 0.0, 0.0, 0.0), None, gt.gt_id, defect)
+        ids = target.scene_id, target.im_id, target.obj_id
+        return Detection(*ids, 1.0, 0.0, box or (0.0, 0.0, 0.0, 0.0), None, gt.gt_id, defect)

@@ -21,8 +21,8 @@ from pipeline.stages.detect.annotated import annotation_paths, image_paths, sele
 class GtMask(Detector):
     """Masks of annotated instances, score 1, the ``inst_count`` most visible of each target.
 
-    ``visible``: the visible part (mask_visib/), otherwise the whole silhouette (mask/). A mask that is missing, broken,
-    empty or of another size than its image is a Detection with a defect.
+    ``visible``: the visible part (mask_visib/), otherwise the full silhouette (mask/). A mask that is missing, broken,
+    empty or of another size than its image becomes a Detection with a defect.
     """
 
     kind: ClassVar[str] = "detect.gt_mask"
@@ -31,7 +31,7 @@ class GtMask(Detector):
     visible: bool = True
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """Annotations of the scenes, the photographs for their size, and the masks that are there."""
+        """Annotations of the scenes, the images (for their size), and the masks that exist."""
         masks = [
             dataset.mask_path(target.scene_id, target.im_id, gt.gt_id, visible=self.visible)
             for target in targets
@@ -44,16 +44,18 @@ class GtMask(Detector):
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
         """One detection per annotated instance of the targets."""
-        return [self._detection(dataset, target, gt) for target in targets for gt in select_instances(dataset, target)]
+        return [
+            self._read_detection(dataset, target, gt) for target in targets for gt in select_instances(dataset, target)
+        ]
 
-    def _detection(self, dataset: Dataset, target: Target, gt: GroundTruth) -> Detection:
+    def _read_detection(self, dataset: Dataset, target: Target, gt: GroundTruth) -> Detection:
         ids = target.scene_id, target.im_id
         path = dataset.mask_path(*ids, gt.gt_id, visible=self.visible).relative_to(dataset.root)
         box = gt.bbox_visib_xyxy or (0.0, 0.0, 0.0, 0.0)
         try:
             mask = dataset.mask(*ids, gt.gt_id, visible=self.visible)
         except BadInput as fault:
-            unread = f"{path}: found {fault.found}, needs {fault.needed}"  # the same wherever the dataset lies
+            unread = f"{path}: found {fault.found}, needs {fault.needed}"  # a relative path: defects enter keys
             return Detection(*ids, gt.obj_id, 1.0, 0.0, box, None, gt.gt_id, unread)
         defect, size_hw = None, dataset.image_size(*ids)
         if mask.shape != size_hw:

@@ -23,13 +23,13 @@ from pipeline.stages.detect.annotated import image_paths
 
 @spec
 class Json(Detector):
-    """Detections in the json of BOP's and CNOS's default detections, plain or gzipped.
+    """Detections in the JSON format of BOP's and CNOS's default detections, plain or gzipped.
 
     A list of {scene_id, image_id, category_id, score, bbox [x, y, w, h], time, segmentation {size, counts}}; ``time``
-    and ``segmentation`` may be missing. Only entries of the targets' images and objects are looked at.
+    and ``segmentation`` may be missing. Only entries of the targets' images and objects are read.
 
-    ``keep``: how many of a target's detections are kept, by score: "inst_count" as the target says, a number, or "all".
-    An entry that cannot be used (``defect`` says why) is kept only where fewer usable ones are left than that.
+    ``keep``: how many detections of a target are kept, best score first: the target's "inst_count", a number, or "all".
+    Entries that cannot be used (``defect`` says why) only fill up what usable ones leave open.
     """
 
     kind: ClassVar[str] = "detect.json"
@@ -39,22 +39,22 @@ class Json(Detector):
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe, the file by its bytes."""
+        """As Spec.recipe, with the file's digest instead of its path."""
         return super().recipe() | {"path": file_digest(self._file())}
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """The file, and the photographs for their size."""
+        """The file, and the images (for their size)."""
         return [self._file(), *image_paths(dataset, targets)]
 
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
-        """The kept detections of each target, best score first. Raises BadInput for a file of another kind."""
-        entries = _by_target(self._file())
+        """The kept detections of each target, best score first. Raises BadInput for a file in another format."""
+        entries = _group_by_target(self._file())
         return [
             detection
             for target in targets
-            for detection in self._kept(dataset, target, entries[target.scene_id, target.im_id, target.obj_id])
+            for detection in self._select(dataset, target, entries[target.scene_id, target.im_id, target.obj_id])
         ]
 
     def _file(self) -> Path:
@@ -62,22 +62,22 @@ class Json(Detector):
             raise BadInput("detect.path", found="''", needed="the path of a detections file (.json or .json.gz)")
         return Path(self.path).expanduser()
 
-    def _kept(self, dataset: Dataset, target: Target, entries: list[dict[str, Any]]) -> list[Detection]:
+    def _select(self, dataset: Dataset, target: Target, entries: list[dict[str, Any]]) -> list[Detection]:
         if not entries:
             return []
         size_hw = dataset.image_size(target.scene_id, target.im_id)
         count = target.inst_count if self.keep == "inst_count" else len(entries) if self.keep == "all" else self.keep
         usable: list[Detection] = []
         broken: list[Detection] = []
-        for entry in sorted(entries, key=lambda e: -_score(e)):  # sorted is stable: equal scores in file order
-            detection = _detection(entry, target, size_hw)
+        for entry in sorted(entries, key=lambda e: -_read_score(e)):  # stable: ties in file order
+            detection = _read_detection(entry, target, size_hw)
             (broken if detection.defect else usable).append(detection)
             if len(usable) == count:
                 break
         return (usable + broken)[:count]
 
 
-def _by_target(path: Path) -> dict[tuple[int, int, int], list[dict[str, Any]]]:
+def _group_by_target(path: Path) -> dict[tuple[int, int, int], list[dict[str, Any]]]:
     entries = read_json(path)
     if not isinstance(entries, list):
         raise BadInput(path, found=f"a JSON {type(entries).__name__}", needed="a list of detections")
@@ -92,29 +92,29 @@ def _by_target(path: Path) -> dict[tuple[int, int, int], list[dict[str, Any]]]:
     return by_target
 
 
-def _detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, int]) -> Detection:
+def _read_detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, int]) -> Detection:
     ids = target.scene_id, target.im_id, target.obj_id
-    score, time = _score(entry), entry.get("time", -1.0)
+    score, time = _read_score(entry), entry.get("time", -1.0)
     time_s = float(time) if is_number(time) and math.isfinite(time) else -1.0
     try:
         if not math.isfinite(score):
             raise ValueError(f"score is {abbreviate(entry['score'])}, not a finite number")
-        rle = None if entry.get("segmentation") is None else _mask(entry["segmentation"], size_hw)
-        box = _box(entry.get("bbox"), rle, size_hw)
+        rle = None if entry.get("segmentation") is None else _read_mask(entry["segmentation"], size_hw)
+        box = _read_box(entry.get("bbox"), rle, size_hw)
     except ValueError as fault:
         return Detection(*ids, score if math.isfinite(score) else 0.0, time_s, (0.0,) * 4, defect=str(fault))
     return Detection(*ids, score, time_s, box, rle)
 
 
-def _mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
+def _read_mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
     rle = read_rle(segmentation, size_hw)
     if not rle_area(rle):
         raise ValueError("mask is empty")
     return rle
 
 
-def _box(bbox_xywh: Any, rle: dict[str, Any] | None, size_hw: tuple[int, int]) -> Box:
-    """Edges of the entry's box, of its mask when it has no box. Raises ValueError."""
+def _read_box(bbox_xywh: Any, rle: dict[str, Any] | None, size_hw: tuple[int, int]) -> Box:
+    """Edges of the entry's box, or of its mask where it has none. Raises ValueError."""
     if bbox_xywh is None and rle is not None:
         return mask_bbox(decode_rle(rle)) or (0.0,) * 4
     if not isinstance(bbox_xywh, list) or len(bbox_xywh) != 4 or not all(is_number(v) for v in bbox_xywh):
@@ -130,7 +130,7 @@ def _box(bbox_xywh: Any, rle: dict[str, Any] | None, size_hw: tuple[int, int]) -
     return box
 
 
-def _score(entry: dict[str, Any]) -> float:
-    """The entry's score; -inf, so that it comes last, for one that is no finite number."""
+def _read_score(entry: dict[str, Any]) -> float:
+    """The entry's score; -inf, which sorts last, if it is not a finite number."""
     score = entry["score"]
     return float(score) if is_number(score) and math.isfinite(score) else -math.inf

@@ -1,4 +1,4 @@
-"""one's own mask or box -> the one detection."""
+"""the mask or box of dataset=photo -> one detection."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ from pipeline.stages.detect import Descriptors, Detector
 
 @spec
 class PhotoMask(Detector):
-    """The mask or box that ``dataset=photo`` was given, with score 1."""
+    """The mask or box given to ``dataset=photo``, with score 1."""
 
     kind: ClassVar[str] = "detect.photo"
     version: ClassVar[int] = 1
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """The photograph, and the mask if there is one."""
-        photo = _photo(dataset)
+        """The photograph, and its mask file if given."""
+        photo = _require_photo(dataset)
         return [photo.photo_path] + ([] if photo.mask_file is None else [photo.mask_file])
 
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
         """One detection. Raises BadInput for a mask of another size than the photograph, or an empty one."""
-        photo = _photo(dataset)
-        return [_detection(photo, target) for target in targets]
+        photo = _require_photo(dataset)
+        return [_read_detection(photo, target) for target in targets]
 
 
-def _photo(dataset: Dataset) -> Photo:
+def _require_photo(dataset: Dataset) -> Photo:
     if not isinstance(dataset, Photo):
-        raise BadInput("detect", found="photo for a dataset that is none", needed="dataset=photo, or another detect")
+        raise BadInput("detect", found="photo with another dataset", needed="dataset=photo, or another detect")
     if dataset.mask_file is None and dataset.bbox_xyxy is None:
         needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=cnos, which finds the object"
         raise BadInput("dataset", found="neither of mask and bbox", needed=needed)
     return dataset
 
 
-def _detection(photo: Photo, target: Target) -> Detection:
+def _read_detection(photo: Photo, target: Target) -> Detection:
     ids = target.scene_id, target.im_id, target.obj_id
     h, w = photo.image_size(target.scene_id, target.im_id)
     if photo.mask_file is None:

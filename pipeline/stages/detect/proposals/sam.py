@@ -1,4 +1,4 @@
-"""image -> masks of whatever may be an object (Kirillov et al., ICCV 2023, "Segment Anything")."""
+"""image -> masks of possible objects (Kirillov et al., ICCV 2023, "Segment Anything")."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from pipeline.stages.detect.proposals import Proposer
 
 POINTS_PER_BATCH = 64
 _MEAN, _STD = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32)  # of ImageNet
-_BLOCK = 1 << 26  # logits enlarged at a time
+_BLOCK = 1 << 26  # logits upsampled at a time
 
 
 @spec
 class Sam(Proposer):
-    """Masks that SAM or SAM 2 finds at the points of a grid, the reliable ones, without near duplicates.
+    """Masks of SAM or SAM 2 for a grid of points, filtered by confidence and stability, without near duplicates.
 
-    ``weights``: a hub id (``revision`` is for it alone) or a folder as transformers' save_pretrained writes it, of
-    SamModel or Sam2Model; the digest of the files found there stands for both in the recipe.
+    ``weights``: a hub id (with an optional ``revision``) or a folder that save_pretrained wrote, of a SamModel or
+    Sam2Model; the recipe holds the digest of the files instead of these two fields.
 
-    ``min_iou``: of the IoU that the model predicts of its own mask. ``min_stability``: least IoU of the masks whose
-    logits exceed ``stability_offset`` and its negative. ``nms_iou``: of two boxes that overlap more the mask of lower
-    predicted IoU goes. ``min_box_size``: side of a box over that of the image, of squares of their areas;
-    ``min_mask_size``: area of a mask over that of the image (the last two as CNOS has them).
+    ``min_iou``: minimum of the IoU that the model predicts for its mask. ``min_stability``: minimum IoU of the masks
+    thresholded at +- ``stability_offset``. ``nms_iou``: of two boxes with a larger IoU, the mask with the lower
+    predicted IoU is dropped. ``min_box_size``: minimum of sqrt(box area / image area); ``min_mask_size``: minimum of
+    mask area / image area; both as in CNOS.
 
-    Departures from CNOS: the image is not first shrunk to a width of 640, and boxes reach to the pixels' edges.
+    Differences to CNOS: the image is not resized to a width of 640 first, and boxes extend to the pixels' edges.
     """
 
     kind: ClassVar[str] = "proposals.sam"
@@ -60,16 +60,16 @@ class Sam(Proposer):
 
     @cached_property
     def source(self) -> SamWeights:
-        """The weights, found (and fetched, for a hub id). Raises BadInput."""
+        """Where the weights are; a hub id is downloaded first. Raises BadInput."""
         return open_sam_weights(self.weights, self.revision)
 
     @cached_property
     def weights_digest(self) -> str:
-        """sha256 of all files the proposals depend on. Raises BadInput."""
+        """sha256 of all files that the proposals depend on. Raises BadInput."""
         return files_digest(self.source.files)
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe; the weights by digest, wherever they lie."""
+        """As Spec.recipe, with the weights' digest instead of their location."""
         recipe = super().recipe() | {"weights": self.weights_digest}
         del recipe["revision"]
         return recipe
@@ -84,12 +84,12 @@ class Sam(Proposer):
 
 
 class LoadedSam:
-    """SAM or SAM 2 in memory. ``batch``: points a pass of the mask decoder gets, 0 = the usual 64."""
+    """SAM or SAM 2 in memory. ``batch``: points per pass of the mask decoder; 0 for the usual 64."""
 
     def __init__(self, spec: Sam, model: Any, batch: int = 0) -> None:
         self.spec, self.model, self.batch = spec, model, batch or POINTS_PER_BATCH
         self.side = int(model.config.prompt_encoder_config.image_size)
-        self.squeezed = model.config.model_type != "sam"  # SAM 2 resizes to a square, SAM pads to one
+        self.resizes_to_square = model.config.model_type != "sam"  # SAM 2; SAM pads instead
 
     @torch.inference_mode()
     def __call__(self, image: Image) -> list[Proposal]:
@@ -97,8 +97,8 @@ class LoadedSam:
         size_hw = (image.rgb.shape[0], image.rgb.shape[1])
         found = [
             Proposal(box, encode_rle(mask), confidence)
-            for logits, iou in self._decoded(image.rgb)
-            for mask, confidence in self._reliable(logits, iou, size_hw)
+            for logits, iou in self._decode(image.rgb)
+            for mask, confidence in self._filter(logits, iou, size_hw)
             if (box := mask_bbox(mask)) is not None and mask.mean() > self.spec.min_mask_size
         ]
         boxes = np.array([p.bbox_xyxy for p in found]).reshape(-1, 4)
@@ -107,60 +107,60 @@ class LoadedSam:
         kept &= area(boxes) > self.spec.min_box_size**2 * size_hw[0] * size_hw[1]
         return [found[i] for i in np.argsort(-score, kind="stable") if kept[i]]
 
-    def _decoded(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Iterator[tuple[Float[Tensor, "m s s"], Float[Tensor, " m"]]]:
-        """Logits and predicted IoU of three masks at each point of the grid, some points at a time."""
+    def _decode(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Iterator[tuple[Float[Tensor, "m s s"], Float[Tensor, " m"]]]:
+        """Logits and predicted IoU of three masks for each point of the grid, one batch of points at a time."""
         used_hw = self.used_hw((rgb.shape[0], rgb.shape[1]))
-        embeddings = self.model.get_image_embeddings(self.input(rgb).to(self.model.device))
-        for points in grid(self.spec.points_per_side, used_hw).split(self.batch):
-            asked = points[None, :, None].to(self.model.device)
-            answer = self.model(image_embeddings=embeddings, input_points=asked, multimask_output=True)
-            yield answer.pred_masks[0].flatten(0, 1), answer.iou_scores[0].flatten()
+        embeddings = self.model.get_image_embeddings(self.prepare(rgb).to(self.model.device))
+        for points in make_grid(self.spec.points_per_side, used_hw).split(self.batch):
+            prompts = points[None, :, None].to(self.model.device)
+            output = self.model(image_embeddings=embeddings, input_points=prompts, multimask_output=True)
+            yield output.pred_masks[0].flatten(0, 1), output.iou_scores[0].flatten()
 
-    def _reliable(
+    def _filter(
         self, logits: Float[Tensor, "m s s"], iou: Float[Tensor, " m"], size_hw: tuple[int, int]
     ) -> Iterator[tuple[Bool[np.ndarray, "H W"], float]]:
-        """Masks of the image's size that pass both thresholds, with their predicted IoU."""
+        """Masks at the image's size that pass both thresholds, with their predicted IoU."""
         chosen = iou > self.spec.min_iou
         if not chosen.any():
-            return  # none of these points
-        at_once = max(1, _BLOCK // max(self.side**2, size_hw[0] * size_hw[1]))
-        for small, confidence in zip(logits[chosen].split(at_once), iou[chosen].split(at_once), strict=True):
-            large = self.enlarged(small, size_hw)
-            stable = stability(large, offset=self.spec.stability_offset) > self.spec.min_stability
+            return
+        block = max(1, _BLOCK // max(self.side**2, size_hw[0] * size_hw[1]))
+        for small, confidence in zip(logits[chosen].split(block), iou[chosen].split(block), strict=True):
+            large = self.upsample(small, size_hw)
+            stable = compute_stability(large, offset=self.spec.stability_offset) > self.spec.min_stability
             masks = (large[stable] > 0).cpu().numpy()
             yield from zip(masks, confidence[stable].tolist(), strict=True)
 
     def used_hw(self, size_hw: tuple[int, int]) -> tuple[int, int]:
-        """Height and width that an image takes in the model's square input."""
-        if self.squeezed:
+        """Height and width of an image within the model's square input."""
+        if self.resizes_to_square:
             return self.side, self.side
         scale = self.side / max(size_hw)
         return int(size_hw[0] * scale + 0.5), int(size_hw[1] * scale + 0.5)
 
-    def input(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Float[Tensor, "1 3 side side"]:
-        """The image as the model takes it: resized, normalised, black on the right or below where it is padded."""
+    def prepare(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Float[Tensor, "1 3 side side"]:
+        """The model's input: resized, normalised, and for SAM padded with zeros on the right or below."""
         h, w = self.used_hw((rgb.shape[0], rgb.shape[1]))
         resized = np.asarray(Picture.fromarray(rgb).resize((w, h), Picture.Resampling.BILINEAR), np.float32) / 255
         normal = torch.from_numpy((resized - _MEAN) / _STD).movedim(-1, 0)
         return F.pad(normal, (0, self.side - w, 0, self.side - h))[None]
 
-    def enlarged(self, logits: Float[Tensor, "m s s"], size_hw: tuple[int, int]) -> Float[Tensor, "m H W"]:
-        """Logits of the model's square input at the pixels of the image."""
+    def upsample(self, logits: Float[Tensor, "m s s"], size_hw: tuple[int, int]) -> Float[Tensor, "m H W"]:
+        """Logits resampled from the model's square input to the image's pixels."""
         large = logits[None]
-        if not self.squeezed:
+        if not self.resizes_to_square:
             h, w = self.used_hw(size_hw)
             large = F.interpolate(large, (self.side, self.side), mode="bilinear", align_corners=False)[..., :h, :w]
         return F.interpolate(large, size_hw, mode="bilinear", align_corners=False)[0]
 
 
-def grid(per_side: int, used_hw: tuple[int, int]) -> Float[Tensor, "m 2"]:
-    """Centres (x, y) of ``per_side`` squared equal cells, row by row, in pixels from the input's edge."""
+def make_grid(per_side: int, used_hw: tuple[int, int]) -> Float[Tensor, "m 2"]:
+    """Centres (x, y) of ``per_side`` x ``per_side`` equal cells in row-major order, px from the input's edge."""
     centres = (torch.arange(per_side, dtype=torch.float64) + 0.5) / per_side
     y, x = torch.meshgrid(centres * used_hw[0], centres * used_hw[1], indexing="ij")
     return torch.stack([x.flatten(), y.flatten()], dim=1).float()
 
 
-def stability(logits: Float[Tensor, "m H W"], *, offset: float) -> Float[Tensor, " m"]:
-    """IoU of the masks of logits above ``offset`` and above its negative; 0 where both are empty."""
+def compute_stability(logits: Float[Tensor, "m H W"], *, offset: float) -> Float[Tensor, " m"]:
+    """IoU of the masks thresholded at +``offset`` and -``offset``; 0 where both are empty."""
     inner, outer = ((logits > bound).sum((1, 2)) for bound in (offset, -offset))
     return inner / outer.clamp(min=1)
