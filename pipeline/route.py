@@ -31,8 +31,10 @@ from pipeline.method import Stages
 from pipeline.spec import NonNegative, spec
 from pipeline.stages.cluster import require_cells
 from pipeline.stages.lift import lift
+from pipeline.stages.solve import Plane
 
 MIN_POINTS = 4
+LARGEST_CROP_PX = 160  # side, in image pixels, of the largest crop whose solver threshold is in image pixels
 
 
 @spec
@@ -151,19 +153,16 @@ class Route:
 
     def solve_pose(self, points_obj: Float[np.ndarray, "m 3"], query_px_img: Float[np.ndarray, "m 2"]) -> PoseSolution:
         """The pose of the points on the object, solved in the solver's plane; its error is in image pixels."""
-        query, solve = self.query, self.stages.solve
+        query = self.query
         on_object = np.isfinite(points_obj).all(1)
         if on_object.sum() < MIN_POINTS:
             raise NoPose("lift", f"{on_object.sum()} correspondences lie on the object, PnP needs {MIN_POINTS}")
-        points, px_img, inliers = points_obj[on_object], query_px_img[on_object], np.zeros(len(on_object), bool)
-        if solve.plane == "image":
-            solution = solve(points, px_img, query.K)
-            inliers[on_object] = solution.inliers
-            return PoseSolution(solution.T_cam_obj, inliers, solution.reprojection_px)
-        K_crop, R_crop_cam = camera.crop_camera(query.A_crop_img, query.K)
-        solution = solve(points, camera.apply_homography(query.A_crop_img, px_img), K_crop)
+        A_plane_img, K_plane, R_plane_cam = solver_plane(self.stages.solve.plane, query, self.stages.crop.size)
+        px_plane = camera.apply_homography(A_plane_img, query_px_img[on_object])
+        solution = self.stages.solve(points_obj[on_object], px_plane, K_plane)
+        inliers = np.zeros(len(on_object), bool)
         inliers[on_object] = solution.inliers
-        T_cam_obj = pose_in_image(solution.T_cam_obj, R_crop_cam)
+        T_cam_obj = pose_in_image(solution.T_cam_obj, R_plane_cam)
         error_px = reprojection_error_px(points_obj[inliers], query_px_img[inliers], query.K, T_cam_obj)
         return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px**2))))
 
@@ -219,6 +218,22 @@ class Route:
         true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
         true_px = torch.from_numpy(camera.apply_homography(query.A_crop_img, true_px_img)).to(template_px.device)
         return TrueMatches(template_px, true_px, query.crop.mask)
+
+
+def solver_plane(
+    plane: Plane, query: Query, crop_size: int
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """A_plane_img, K_plane and R_plane_cam of the plane that a solver works in.
+
+    The image's plane is scaled down where the crop is larger than ``LARGEST_CROP_PX`` in it, so that a threshold in
+    pixels never means less than a fixed share of the object: features do not locate points any finer.
+    """
+    if plane == "crop":
+        return query.A_crop_img, *camera.crop_camera(query.A_crop_img, query.K)
+    centre = camera.apply_homography(np.linalg.inv(query.A_crop_img), np.full((1, 2), (crop_size - 1) / 2))
+    side_px = crop_size / float(camera.local_zoom(query.A_crop_img, centre)[0])
+    A_plane_img = camera.resize_affine(min(1.0, LARGEST_CROP_PX / side_px))
+    return A_plane_img, A_plane_img @ query.K, np.eye(3)
 
 
 def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:

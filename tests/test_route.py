@@ -54,6 +54,21 @@ def test_a_threshold_in_the_crop_is_of_crop_pixels_and_the_error_of_image_pixels
     assert in_image.reprojection_px == pytest.approx(rms, abs=1e-3)
 
 
+@pytest.mark.parametrize("megapixels", [0.3, 4.0, 50.0, 200.0])
+def test_a_larger_photograph_of_the_same_scene_keeps_its_inliers(megapixels):
+    """Features locate points to a share of the crop, so the error in pixels grows with the image."""
+    factor = (megapixels / 0.3) ** 0.5
+    A_large = camera.resize_affine(factor)
+    points = np.random.default_rng(0).uniform(-60, 60, (80, 3))
+    noise = np.random.default_rng(1).normal(size=(80, 2))
+    px = camera.apply_homography(A_large, camera.project(K, rigid.transform(T, points)) + 2.0 * noise)
+    query = Query(NOTHING, CROPS["square"] @ np.linalg.inv(A_large), A_large @ K)
+    found = Route(replace(PAPER, solve=Epnp(threshold_px=8.0)), query, bank=None).solve_pose(points, px)
+    assert found.inliers.mean() > 0.95
+    assert found.reprojection_px == pytest.approx(2.7 * factor, rel=0.1)
+    assert np.linalg.norm(found.T_cam_obj[:3, 3] - T[:3, 3]) < 12  # mm, as at 0.3 megapixels
+
+
 def view(A_crop_img: np.ndarray, T_cam_obj: np.ndarray) -> TemplateView:
     return TemplateView(NOTHING, A_crop_img, np.zeros((4, 4)), K, T_cam_obj)
 

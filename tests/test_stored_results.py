@@ -4,6 +4,7 @@ import json
 import tarfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command import run_dzop
 from make_store import ARCHIVE, METHODS, SMALL
@@ -22,21 +23,31 @@ def answers(out: Path) -> list[dict]:
     return json.loads(path.read_text())["answers"]
 
 
+RECOMPUTED = {"poses", "scores"}
+"""Version 3 of the poses: the solver's threshold follows the size of the crop."""
+
+
 @pytest.mark.parametrize("name", METHODS)
-def test_a_store_of_an_older_commit_is_reused_whole(folder, capsys, monkeypatch, name):
+def test_a_store_of_an_older_commit_is_reused_where_results_did_not_change(folder, capsys, monkeypatch, name):
     ran = run_dzop(capsys, monkeypatch, *SMALL, *METHODS[name], "out=again")
     assert ran.status == 0, ran.err
     (counts,) = ran.counts()
-    assert {step: computed for step, (computed, _) in counts.items()} == dict.fromkeys(counts, 0)
-    assert {"templates", "template features", "query features", "poses", "scores"} <= counts.keys()
-    assert all(reused for _, reused in counts.values())
-    assert answers(folder / "again") == answers(folder / "results" / name)
+    assert {step for step, (computed, _) in counts.items() if computed} == RECOMPUTED
+    assert {"templates", "template features", "query features"} <= counts.keys()
+    assert all(reused for step, (_, reused) in counts.items() if step not in RECOMPUTED)
+    for now, before in zip(answers(folder / "again"), answers(folder / "results" / name), strict=True):
+        assert now["template_id"] == before["template_id"]
+        # mm; another processor's rounding turns a correspondence or two
+        np.testing.assert_allclose(now["T_cam_obj"], before["T_cam_obj"], atol=1.0)
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_results_of_an_older_commit_are_not_made_again_by_a_sweep(folder, capsys, monkeypatch, name):
-    before = {path: path.read_bytes() for path in (folder / "results").rglob("*") if path.is_file()}
-    ran = run_dzop(capsys, monkeypatch, "-m", *SMALL, *METHODS[name], f"out=results/{name}")
-    assert ran.status == 0, ran.err
-    assert ran.counts() == [{"detections": (0, 1)}]  # it reads which targets there are, and does nothing else
-    assert {path: path.read_bytes() for path in before} == before
+def test_results_are_not_made_again_by_a_sweep(folder, capsys, monkeypatch, name):
+    older = {path: path.read_bytes() for path in (folder / "results").rglob("*") if path.is_file()}
+    sweep = ("-m", *SMALL, *METHODS[name], f"out=results/{name}")
+    assert run_dzop(capsys, monkeypatch, *sweep).status == 0
+    again = run_dzop(capsys, monkeypatch, *sweep)
+    assert again.status == 0, again.err
+    assert again.counts()[-1] == {"detections": (0, 1)}  # it reads which targets there are, and does nothing else
+    changed = [path for path in older if path.read_bytes() != older[path]]
+    assert all(path.parent.name == "rows" for path in changed), changed

@@ -22,7 +22,7 @@ from pipeline.route import template_pose, trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
-POSES_VERSION = 2
+POSES_VERSION = 3
 
 
 @dataclass(eq=False)

@@ -23,8 +23,9 @@ PnpPoints = Annotated[int, Field(ge=4)]  # three points allow up to four poses
 class Solver(Spec, ABC):
     """Contract of a solve variant.
 
-    ``plane``: whose pixels and camera it is given, and so what its threshold is measured in: the full ``image``'s, or
-    the ``crop``'s, where a threshold is the same share of every object, near or far.
+    ``plane``: the plane whose pixels its threshold is measured in. ``crop``: a threshold is the same share of every
+    object, near or far. ``image``: pixels of the full image, scaled down where the crop is larger than 160 of them, so
+    that a photograph of many megapixels does not make the threshold finer than the features (route.solver_plane).
     """
 
     plane: Plane = "image"
