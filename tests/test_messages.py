@@ -126,8 +126,8 @@ def test_a_suspicious_mask_is_warned_about_and_recorded(photo, tmp_path, mask, m
     ("given", "message"),
     [
         (("dataset.bbox=[40,30,130,100]",), "of the box lies outside the image; is it x, y, width, height"),
-        (("dataset.bbox=[40,30,60,60]", "dataset.K=[300,300,170,90]"), "principal point (170, 90) lies outside"),
-        (("dataset.bbox=[40,30,60,60]", "dataset.K=[80,60,75,150]"), "principal point (75, 150) lies outside"),
+        (("dataset.bbox=[40,30,60,60]", "dataset.K=[300,300,170,90]"), "K [300, 300, 170, 90] is unusual"),
+        (("dataset.bbox=[40,30,60,60]", "dataset.K=[80,60,75,150]"), "K [80, 60, 75, 150] is unusual"),
         (("dataset.bbox=[40,30,60,60]",), ""),
     ],
     ids=["corners", "larger image", "swapped", "as it should be"],

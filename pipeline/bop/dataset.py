@@ -130,6 +130,10 @@ class Dataset:
         """The image's camera matrix, px."""
         return self.scene(scene_id).camera(im_id).K
 
+    def distortion(self, scene_id: int, im_id: int) -> tuple[float, ...]:
+        """Lens coefficients that the camera's record states and that nothing here applies; () without any."""
+        return self.scene(scene_id).camera(im_id).distortion
+
     def depth_path(self, scene_id: int, im_id: int) -> Path:
         """The depth image's file."""
         return self.scene(scene_id).depth_path(im_id)

@@ -69,6 +69,15 @@ def image_size(path: Path) -> tuple[int, int]:
         raise _unreadable_image(path, error) from None
 
 
+def read_orientation(path: Path) -> int:
+    """EXIF orientation that ``read_rgb`` applies, 1 to 8; 1 without one and for a file that cannot be read."""
+    try:
+        with _open_header(path) as image:
+            return _read_orientation(image)
+    except _BROKEN:
+        return 1
+
+
 def _open_header(path: Path) -> PIL.Image.Image:
     if path.exists() and not path.is_file():
         raise OSError("not a regular file")

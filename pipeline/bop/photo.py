@@ -14,6 +14,7 @@ from pipeline.bop.images import image_size, read_rgb
 from pipeline.bop.jsonio import is_number
 from pipeline.bop.scene import Box, check_K, xyxy_from_xywh
 from pipeline.errors import BadInput
+from pipeline.functional.camera_diagnosis import denormalize_camera
 from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
@@ -47,6 +48,9 @@ class PhotoConfig(Spec):
         image = Path(self.image).expanduser()
         size_hw = image_size(image)
         K = self._matrix()
+        if pixels := denormalize_camera(K, size_hw):
+            found, fitting = f"{list(self.K)}, divided by the image's size", ",".join(f"{v:.6g}" for v in pixels)
+            raise BadInput("dataset.K", found=found, needed=f"pixels: 'dataset.K=[{fitting}]'")
         check_K(K, size_hw, "dataset.K")
         _check_principal_point(K, size_hw)
         if self.mask is not None and self.bbox is not None:
@@ -133,6 +137,10 @@ class Photo(Dataset):
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
         """The photograph's camera matrix, px."""
         return self.camera_matrix
+
+    def distortion(self, scene_id: int, im_id: int) -> tuple[float, ...]:
+        """(): a photograph is given with K alone."""
+        return ()
 
     def has_ground_truth(self, scene_id: int) -> bool:
         """False: a photograph has no ground truth."""

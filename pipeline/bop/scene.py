@@ -25,10 +25,14 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """An image's camera matrix, px. ``depth_scale``: mm per unit of the depth image, None if unknown."""
+    """An image's camera matrix, px. ``depth_scale``: mm per unit of the depth image, None if unknown.
+
+    ``distortion``: lens coefficients stated beside K that are not 0; images are taken as undistorted.
+    """
 
     K: Float[np.ndarray, "3 3"]
     depth_scale: float | None
+    distortion: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +96,11 @@ class Scene:
         scale = record.get("depth_scale") if isinstance(record, dict) else None
         if scale is not None and not (is_number(scale) and np.isfinite(scale) and scale > 0):
             raise BadInput(f"{where}, field depth_scale", found=abbreviate(scale), needed="a number > 0")
+        if isinstance(record, dict) and "cam_K" not in record and "cam_model" in record:
+            found = f"cam_model {abbreviate(record['cam_model'])} and no cam_K"
+            raise BadInput(where, found=found, needed="cam_K of a pinhole camera: undistort the images first")
         K = get_numbers(record, "cam_K", 9, where).reshape(3, 3)
-        return Camera(K, None if scale is None else float(scale))
+        return Camera(K, None if scale is None else float(scale), _read_distortion(record))
 
     def ground_truth(self, im_id: int) -> list[GroundTruth]:
         """Annotated instances of one image. Raises BadInput for a missing annotation or an impossible pose."""
@@ -137,6 +144,12 @@ class Scene:
         where = describe_place(self.folder, scene=self.scene_id, image=im_id)
         names = ", ".join(pattern.format(im_id) for pattern in patterns)
         raise BadInput(where, found="no file", needed=f"{what} at one of {names}")
+
+
+def _read_distortion(record: dict[str, Any]) -> tuple[float, ...]:
+    """Lens distortion coefficients of a camera's record that are not 0, whatever the field is called."""
+    values = [value for name, value in record.items() if "dist" in name.lower() and isinstance(value, list)]
+    return tuple(float(v) for v in values[0] if is_number(v) and v != 0) if values else ()
 
 
 def xyxy_from_xywh(bbox_xywh: Sequence[float]) -> Box:

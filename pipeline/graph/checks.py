@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.bop.images import read_orientation
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput
+from pipeline.functional.camera_diagnosis import diagnose_camera
 from pipeline.graph.context import Context, ImageId
 from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.views import Detection
@@ -50,6 +52,10 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
             warnings.append(f"scene {scene_id}, image {im_id}: {problem}")
+        if coefficients := context.dataset.distortion(scene_id, im_id):
+            shown = ", ".join(f"{value:g}" for value in coefficients[:4])
+            reason = f"distortion coefficients ({shown}) are not applied; undistort the images for exact poses"
+            warnings.append(f"scene {scene_id}, image {im_id}: {reason}")
     for d in detections:
         if d.defect is None and (problem := _check_detection(context, d)):
             warnings.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {problem}")
@@ -57,11 +63,8 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
 
 
 def _check_camera(context: Context, image: ImageId) -> str:
-    (h, w), (cx, cy) = context.dataset.image_size(*image), context.K(image)[:2, 2]
-    if 0 <= cx <= w and 0 <= cy <= h:
-        return ""
-    outside = f"({cx:g}, {cy:g}) lies outside the image of {w} x {h} (width x height)"
-    return f"K's principal point {outside}; is it the K of this image at this size?"
+    orientation = read_orientation(context.dataset.image_path(*image))
+    return diagnose_camera(context.K(image), context.dataset.image_size(*image), exif_orientation=orientation)
 
 
 def _check_detection(context: Context, d: Detection) -> str:

@@ -150,6 +150,22 @@ def test_models_folder_is_chosen_by_argument(root: Path):
     assert open_tiny(root, models="models_cad").object_model(1).obj_id == 1
 
 
+@pytest.mark.parametrize(
+    ("stated", "read"),
+    [
+        ({}, ()),
+        ({"dist_coeffs": [0, 0, 0, 0, 0]}, ()),
+        ({"dist_coeffs": [0.1, -0.2, 0, 0, 0.05]}, (0.1, -0.2, 0.05)),
+        ({"cam_dist": [-0.3, 0.09]}, (-0.3, 0.09)),
+        ({"distortion": [0.01]}, (0.01,)),
+    ],
+)
+def test_distortion_coefficients_that_are_not_zero_are_read(tmp_path, stated, read):
+    root = write_tiny_bop(tmp_path / "tiny")
+    edit_json(root / "test" / "000007" / "scene_camera.json", lambda cameras: cameras["0"].update(stated))
+    assert open_dataset(root, name="tiny").distortion(7, 0) == read
+
+
 def test_camera_of_a_crop_is_accepted():
     K_crop = np.array([[572.4, 0, 325.3 - 500], [0, 573.6, 242.0 - 400], [0, 0, 1]])
     check_K(K_crop, (120, 180), "crop")
@@ -158,6 +174,11 @@ def test_camera_of_a_crop_is_accepted():
 @pytest.mark.parametrize(
     ("file", "edit", "parts"),
     [
+        (
+            "scene_camera.json",
+            lambda c: c.update({"3": {"cam_model": {"projection_model_type": "CAMERA_MODEL_FISHEYE624"}}}),
+            ["image 3", "cam_model", "no cam_K", "undistort"],
+        ),
         ("scene_camera.json", lambda c: c.pop("3"), ["scene 7", "image 3", "no entry", "cam_K"]),
         ("scene_camera.json", lambda c: c["3"].update(cam_K=K[:8]), ["image 3", "cam_K", "8 elements|8", "9 numbers"]),
         (
