@@ -1,4 +1,4 @@
-"""Every file of conf/sweep and conf/variation says what it is and composes."""
+"""Every file of conf/sweep and conf/variation has its own name and composes."""
 
 from pathlib import Path
 
@@ -37,14 +37,14 @@ def test_a_sweep_names_itself_and_every_job_of_it_composes(name):
 
 
 @pytest.mark.parametrize("axis", ABLATIONS)
-def test_the_papers_ablations_run_at_the_papers_points(axis):
+def test_sweeps_use_the_papers_points(axis):
     points = {str(x) for x, _ in ABLATIONS[axis]}
     swept = next(grid(name)[axis] for name in SWEEPS if axis in grid(name))
     assert set(str(swept).split(",")) == points
 
 
 @pytest.mark.parametrize("name", VARIATIONS)
-def test_a_variation_names_itself_and_changes_what_it_says(name):
+def test_a_variation_names_itself_and_changes_only_its_stages(name):
     plain, config = composed(), composed(f"variation={name}")
     assert config["variation"] == name
     expected = {
@@ -59,7 +59,7 @@ def test_a_variation_names_itself_and_changes_what_it_says(name):
     assert {key for key in plain if plain[key] != config[key]} - {"variation"} == expected
 
 
-def test_the_command_line_wins_over_a_variation():
+def test_the_command_line_overrides_a_variation():
     assert composed("variation=no_subpixel", "correspond.kernel=5")["correspond"]["kernel"] == 5
     assert composed("variation=oracle_mask", "detect=gt_bbox")["detect"]["_target_"].endswith("GtBbox")
 

@@ -18,7 +18,7 @@ from pipeline.report.run_records import RunRecord
 
 
 def record(*, correct: bool) -> RunRecord:
-    """Twelve instances in four images, all right or all wrong."""
+    """A run on twelve instances in four images, all correct or all wrong."""
     n = 12
     hit = np.full((n, 10), correct)
     scores = Scores(np.ones(n, int), np.arange(n) % 4, np.arange(n), np.zeros(n, int), np.ones(n), hit, hit, None, "")
@@ -28,7 +28,7 @@ def record(*, correct: bool) -> RunRecord:
 
 
 def stand_in(monkeypatch, record_of) -> list[list[str]]:
-    """Rows without runs; the lists of overrides that would have been run, in order."""
+    """Records without runs; returns the lists of overrides that would have been run, in order."""
     asked: list[list[str]] = []
     monkeypatch.setattr(accuracy, "run_all", lambda overrides_of, jobs: asked.extend(overrides_of.values()))
     monkeypatch.setattr(accuracy, "read_run_records", lambda out: [record_of(out)])

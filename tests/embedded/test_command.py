@@ -8,7 +8,7 @@ from pipeline.embedded import __main__ as command
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_weights_are_replaced_only_once_every_stage_has_ended(monkeypatch, tmp_path, capsys, ended):
+def test_weights_are_replaced_only_once_every_stage_is_complete(monkeypatch, tmp_path, capsys, ended):
     exported, asked = [], []
     monkeypatch.setattr(command, "_make_shards", lambda *_: None)
     for name in ("Autoencoder", "Denoiser", "Descriptors"):

@@ -23,7 +23,7 @@ PLAN = TrainingPlan(shards=1, autoencoder=3, denoiser=2, descriptors=2, easy=1, 
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory) -> Path:
-    """One shard of two objects; made once, as all of these tests read it alone."""
+    """One shard of two objects; made once, as the tests only read it."""
     folder = tmp_path_factory.mktemp("shards")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(views, "OBJECTS_PER_SHARD", 2)
@@ -69,8 +69,8 @@ def test_correspondences_end_on_the_object_and_angles_are_those_of_all_templates
         assert float(own.min()) == float(batch.angle_deg[0, c, 0].min())
 
 
-def test_the_loss_is_least_where_cosines_peak_at_the_true_places(shards):
-    """Directions that turn with the folder: the query's cells are given those of their counterparts in a template."""
+def test_the_loss_is_low_if_cosines_peak_at_the_true_positions(shards):
+    """Query cells get the random descriptors of their corresponding template cells."""
     batch = pair_batch(source(shards), 0, count=1)
     maps = torch.randn(CLUSTERS_PER_OBJECT * (QUERIES + TEMPLATES), 256, CELLS, CELLS)
     random = losses.correspondence_loss(maps, batch, torch.tensor(20.0))
@@ -100,7 +100,7 @@ def test_a_query_scores_itself_highest_among_templates(shards):
     assert float(scores[0, 0, 0, 2]) == pytest.approx(1, abs=1e-5)
 
 
-def test_a_mesh_like_a_scan_differs_from_the_object_in_colour_and_relief_and_nowhere_else(shards):
+def test_an_imitated_scan_differs_from_the_object_only_in_colour_and_relief(shards):
     (clusters,), rng = source(shards).objects(0, 1)
     seen = []
     for _ in range(8):
@@ -114,7 +114,7 @@ def test_a_mesh_like_a_scan_differs_from_the_object_in_colour_and_relief_and_now
     assert np.median(seen) > 5
 
 
-def test_batches_that_other_processes_draw_are_those_drawn_here(folder):
+def test_batches_do_not_depend_on_the_number_of_workers(folder):
     stage = Autoencoder(PLAN, folder, 3)
     here, elsewhere = (list(iterate_batches(stage, 1, workers)) for workers in (0, 2))
     assert len(here) == len(elsewhere) == 2
@@ -122,7 +122,7 @@ def test_batches_that_other_processes_draw_are_those_drawn_here(folder):
 
 
 @pytest.mark.slow
-def test_training_from_nothing_gives_the_same_losses_and_goes_on_as_if_never_stopped(folder, tmp_path, shards):
+def test_training_is_reproducible_and_can_be_resumed(folder, tmp_path, shards):
     torch.set_num_threads(1)
     assert train(Autoencoder(PLAN, folder, 3), folder, until=time.time() + 300)
     whole = curve(folder, "autoencoder")
@@ -139,7 +139,7 @@ def test_training_from_nothing_gives_the_same_losses_and_goes_on_as_if_never_sto
 
 
 @pytest.mark.slow
-def test_every_stage_stands_on_the_one_before_and_all_of_them_ship(folder, tmp_path):
+def test_every_stage_starts_from_the_one_before_and_all_are_exported(folder, tmp_path):
     for kind, steps in ((Autoencoder, 1), (Denoiser, 2), (Descriptors, 2)):
         assert train(kind(PLAN, folder, steps), folder, until=time.time() + 300)
     size = export(folder, tmp_path / "weights")

@@ -22,14 +22,14 @@ def test_two_sweeps_from_one_base_are_two_families_and_share_it():
     assert {family.base.id for family in found.values()} == {base.id}
 
 
-def test_another_variant_is_one_step_whatever_its_fields():
+def test_another_variant_counts_as_one_difference_whatever_its_fields():
     base, other = toy_run(), toy_run(solve=EPNP_TO_POSELIB)
     assert difference(settings(base), settings(other)) == {"solve": "poselib"}
     (family,) = families([base, other])
     assert (family.axis, set(family.values), family.numeric) == ("solve", {"epnp", "poselib"}, False)
 
 
-def test_another_variant_within_a_variant_is_one_step_too():
+def test_another_variant_within_a_variant_counts_as_one_difference_too():
     hog, dino = ({"_target_": f"a.{name}.A", "size": i} for i, name in enumerate(("hog", "dino")))
     base = toy_run(detect={"_target_": "d.cnos.D", "min_score": 0.1, "describe": hog})
     other = toy_run(detect={"_target_": "d.cnos.D", "min_score": 0.1, "describe": dino})
@@ -38,12 +38,12 @@ def test_another_variant_within_a_variant_is_one_step_too():
     assert difference(settings(base), settings(larger)) == {"detect.describe.size": 7}
 
 
-def test_runs_two_steps_away_belong_to_no_family_of_the_base():
+def test_runs_with_two_differences_belong_to_no_family_of_the_base():
     rows = [toy_run(), toy_run(cluster__count=40), toy_run(cluster__count=80, fuse__dim=32)]
     assert [family.values for family in families(rows)] == [(40, 200)]
 
 
-def test_what_changes_no_answer_makes_no_family():
+def test_settings_that_cannot_change_results_make_no_family():
     assert families([toy_run(), toy_run(evaluate__theta_max=0.1)]) == []
     assert families([toy_run(), toy_run(out="elsewhere")]) == []
 
@@ -52,7 +52,7 @@ def test_switched_off_parts_and_oracles_stay_out_of_families():
     assert families([toy_run(), toy_run(variation="no_subpixel", correspond__kernel=1)]) == []
 
 
-def test_the_base_is_the_run_most_others_are_one_step_from():
+def test_the_base_is_the_run_that_most_others_differ_from_in_one_setting():
     rows = [toy_run(cluster__count=40, fuse__dim=32), toy_run(), toy_run(cluster__count=40), toy_run(fuse__dim=32)]
     assert base_of([*rows, toy_run(correspond__kernel=1)]).id == rows[1].id
 
@@ -63,7 +63,7 @@ def test_a_list_of_layers_is_a_value():
     assert set(family.values) == {(2, 5, 8, 11), (8,)}
 
 
-def test_runs_scored_on_other_meshes_or_of_other_meshes_are_not_the_same_run():
+def test_runs_scored_on_other_meshes_or_with_other_models_are_different_runs():
     base = toy_run(evaluate={"theta_max": 0.5, "models": "models_eval"})
     other = toy_run(evaluate={"theta_max": 0.1, "models": "models"})
     assert difference(settings(base), settings(other)) == {"evaluate.models": "models"}

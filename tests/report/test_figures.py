@@ -20,7 +20,7 @@ def objects_of(figure: Figure) -> list[int]:
 
 
 @pytest.mark.parametrize("runs", [1, 7])
-def test_many_objects_are_shared_out_over_figures_of_few_bars(runs):
+def test_many_objects_are_split_into_figures_with_few_bars(runs):
     drawn = figures.objects_figures({str(n): of_many_objects(30) for n in range(runs)}, "tless")
     assert [obj_id for figure in drawn for obj_id in objects_of(figure)] == list(range(1, 31))
     for figure in drawn:
@@ -39,7 +39,7 @@ def test_published_bars_are_hollow_dashed_and_only_of_their_own_dataset():
     assert all(not bar.get_fill() and bar.get_linestyle() == "--" for bars in found for bar in bars)
 
 
-def test_the_papers_curve_has_axes_of_its_own_and_other_axes_have_none():
+def test_the_papers_curve_has_its_own_axes_if_the_paper_has_one():
     known, unknown = (
         figures.family_figure(families([toy_run(), toy_run(**change)])[0])
         for change in ({"cluster__count": 40}, {"match__top_k": 5})
@@ -51,7 +51,7 @@ def test_the_papers_curve_has_axes_of_its_own_and_other_axes_have_none():
     assert len(unknown.canvas.axes) == 1
 
 
-def test_a_metric_keeps_its_colour_where_vsd_is_missing():
+def test_a_metric_keeps_its_colour_if_vsd_is_missing():
     def colours(row):
         (axes,) = figures.thresholds_figure(row).canvas.axes
         return {line.get_label()[:4]: line.get_color() for line in axes.lines}
@@ -59,14 +59,14 @@ def test_a_metric_keeps_its_colour_where_vsd_is_missing():
     assert colours(toy_run(vsd=False)).items() < colours(toy_run()).items()
 
 
-def test_a_figure_is_real_text_and_the_same_every_time():
+def test_a_figure_contains_text_and_is_reproducible():
     first, second = (figures.theta_figure({"run": toy_run()}, "demo").svg() for _ in range(2))
     assert first == second
     assert ">published, LM-O<" in first.replace("</tspan>", "")
     assert "<metadata>" not in first
 
 
-def test_names_of_any_length_leave_the_axes_their_room():
+def test_long_names_leave_room_for_the_axes():
     long = "match.layer=8, " * 12 + "solve._target_=pipeline.stages.solve.poselib.PoseLib"
     rows = {long: toy_run(), long + " too": toy_run(0.3)}
     drawn = figures.times_figure(rows), figures.theta_figure(rows, "demo"), *figures.objects_figures(rows, "demo")

@@ -47,13 +47,13 @@ def test_a_pair_of_clusters_has_one_colour_in_both_pictures():
     assert len(corners) == 4
 
 
-def test_a_cluster_without_a_partner_is_grey():
+def test_an_unmatched_cluster_is_grey():
     query, _ = paint_clusters(quarters([(0, 0)]), grey(), grey())
     r, g, b = query[3 * PANEL_PX // 4, 3 * PANEL_PX // 4].tolist()
     assert r == g == b
 
 
-def test_a_whole_card_has_four_rows_and_a_failure_says_why():
+def test_a_complete_card_has_four_rows_and_a_failure_says_why():
     clusters = quarters([(0, 0), (1, 1)])
     known = {"template_rgb": grey(), "clusters": clusters}
     whole = draw_card(card(**known, matches=matches(200), inliers=np.arange(200) % 2 == 0))
@@ -71,7 +71,7 @@ def test_the_same_case_gives_the_same_card():
     np.testing.assert_array_equal(first, second)
 
 
-def test_not_more_lines_are_drawn_than_an_eye_can_follow():
+def test_the_number_of_lines_is_limited():
     assert len(pick_evenly(5000, MAX_LINES)) == MAX_LINES
     assert pick_evenly(3, MAX_LINES) == [0, 1, 2]
     assert pick_evenly(0, MAX_LINES) == []
@@ -85,13 +85,13 @@ def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
     ("inliers", "shown"),
     [(np.ones(40, bool), (True, False)), (np.zeros(40, bool), (False, True)), (None, (False, False))],
 )
-def test_inliers_and_outliers_have_their_colours_and_neither_where_no_pose_was_solved(inliers, shown):
+def test_inliers_and_outliers_have_their_colours_unless_no_pose_was_solved(inliers, shown):
     lines = draw_card(card(template_rgb=grey(), matches=matches(40), inliers=inliers))[PANEL_PX + TITLE_PX :]
     lines = lines[: -PANEL_PX - TITLE_PX]
     assert (has(lines, INLIER), has(lines, OUTLIER)) == shown
 
 
-def test_inliers_lie_over_outliers():
+def test_inliers_are_drawn_over_outliers():
     px = torch.tensor([[64.0, 64.0]]).repeat(2, 1)
     same = Correspondences(px, px, torch.ones(2), torch.zeros(2, dtype=torch.int64))
     for inliers in ([True, False], [False, True]):
@@ -107,7 +107,7 @@ def test_the_photograph_is_shown_without_black_beyond_its_border():
 
 
 @pytest.mark.parametrize("bbox", [(-30.0, -20.0, 20.0, 40.0), (300.0, 200.0, 330.0, 250.0), (0.0, 0.0, 319.0, 239.0)])
-def test_a_detection_at_the_border_is_shown_whole(bbox):
+def test_a_detection_at_the_border_has_a_card_of_full_size(bbox):
     photo = Image(1, 0, np.full((240, 320, 3), 255, np.uint8), K)
     mesh, T = make_object(0), np.eye(4)
     T[2, 3] = 900.0

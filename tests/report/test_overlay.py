@@ -30,7 +30,7 @@ def coloured(picture: np.ndarray, role: str) -> np.ndarray:
     return np.abs(picture.astype(int) - COLOURS[role]).max(axis=-1) < 50
 
 
-def test_picture_does_not_change_the_photograph_and_is_repeatable():
+def test_drawing_leaves_the_photograph_unchanged_and_is_reproducible():
     image = photo()
     items = [DrawnPose(CUBE, at(0, 0, 300), "truth"), DrawnPose(CUBE, at(5, 0, 300), "correct", "object 1")]
     first = draw_overlay(image, items)
@@ -57,7 +57,7 @@ def test_outline_surrounds_the_silhouette_in_the_colour_of_its_role(role: str):
     np.testing.assert_allclose([x0, y0, x1, y1], expected, atol=3)
 
 
-def test_estimate_lies_over_ground_truth_whatever_the_order():
+def test_estimates_are_drawn_over_ground_truth_in_any_order():
     truth, estimate = DrawnPose(CUBE, at(0, 0, 300), "truth"), DrawnPose(CUBE, at(0, 0, 300), "correct")
     np.testing.assert_array_equal(draw_overlay(photo(), [truth, estimate]), draw_overlay(photo(), [estimate, truth]))
     assert coloured(draw_overlay(photo(), [truth, estimate])[:500], "correct").sum() > 500
@@ -74,19 +74,19 @@ def test_legend_names_only_what_is_drawn():
 @pytest.mark.parametrize(
     "where", [(0, 0, -300), (0, 0, 10), (0, 0, 35), (4000, 0, 300), (0, 0, 1e7), (1e9, -1e9, 1e-3)]
 )
-def test_no_pose_however_wild_stops_the_picture(where: tuple[float, float, float]):
+def test_any_pose_can_be_drawn(where: tuple[float, float, float]):
     picture = draw_overlay(photo(), [DrawnPose(CUBE, at(*where), "wrong", "object 1  0.12")])
     assert picture.shape == (640, 800, 3)
 
 
-def test_edges_are_cut_at_the_near_plane():
+def test_edges_are_clipped_at_the_near_plane():
     segments = np.array([[[0.0, 0, -10], [0, 10, 30]], [[0, 0, -5], [0, 0, -1]], [[1, 2, 30], [3, 4, 40]]])
     cut = clip_to_front(segments, near_mm=10.0)
     np.testing.assert_allclose(cut, [[[0, 5, 10], [0, 10, 30]], [[1, 2, 30], [3, 4, 40]]], atol=1e-12)  # float64
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
-def test_written_picture_is_whole_and_alone_in_its_folder(tmp_path: Path, name: str):
+def test_writing_a_picture_leaves_no_temporary_file(tmp_path: Path, name: str):
     picture = draw_overlay(photo(), [DrawnPose(CUBE, at(0, 0, 300), "correct", "object 1")])
     write_overlay(tmp_path / "deep" / name, picture)
     assert [p.name for p in (tmp_path / "deep").iterdir()] == [name]

@@ -15,24 +15,24 @@ from pipeline.report.section import Section, sections_of
 LIMIT_BYTES = 15_000_000
 
 
-def page(rows, out) -> str:
-    return write_report(rows, out).page.read_text()
+def page(runs, out) -> str:
+    return write_report(runs, out).page.read_text()
 
 
 @pytest.fixture(scope="module")
-def rows():
+def runs():
     return [toy_run(0.5), *(toy_run(0.3 + n / 1000, at=n // 10, cluster__count=n) for n in (40, 80, 130)), failed_run()]
 
 
 @pytest.fixture(scope="module")
-def built(rows, tmp_path_factory):
+def built(runs, tmp_path_factory):
     """The results folder of a page that several tests look at, and its text."""
     out = tmp_path_factory.mktemp("results")
-    noted = replace(rows[0], notice="random weights: nothing was learned")
-    return out, page([noted, *rows[1:]], out)
+    noted = replace(runs[0], notice="random weights: nothing was learned")
+    return out, page([noted, *runs[1:]], out)
 
 
-def test_a_page_stands_by_itself_and_comes_with_its_figures_and_tables(built):
+def test_a_page_is_self_contained_and_comes_with_figures_and_tables(built):
     tmp_path, text = built
     assert not re.search(r"""(src|href)=["'](?!data:|#)""", text.replace('xlink:href="#', ""))
     assert "<script" not in text
@@ -45,19 +45,19 @@ def test_a_page_stands_by_itself_and_comes_with_its_figures_and_tables(built):
     assert not list((tmp_path / "report").rglob("*.partial"))
 
 
-def test_the_same_rows_give_the_same_page_but_for_its_date(rows, tmp_path):
-    first, second = (re.sub(r"Written [^<]*by", "", page(rows[:2], tmp_path / name)) for name in "ab")
+def test_the_same_runs_give_the_same_page_except_for_its_date(runs, tmp_path):
+    first, second = (re.sub(r"Written [^<]*by", "", page(runs[:2], tmp_path / name)) for name in "ab")
     assert first == second
 
 
-def test_a_failed_job_is_told_first(built):
+def test_a_failed_job_is_listed_first(built):
     _, text = built
-    told = text.index("cluster.count: found -1, needs greater than or equal to 1")
-    assert told < text.index("<main>")
+    position = text.index("cluster.count: found -1, needs greater than or equal to 1")
+    assert position < text.index("<main>")
     assert "cluster.count=-1 sweep=clusters" in text
 
 
-def test_published_numbers_stand_in_tables_of_their_own(built):
+def test_published_numbers_are_in_separate_tables(built):
     _, text = built
     for block in re.findall(r'<figure class="table (measured|published)">(.*?)</figure>', text, flags=re.DOTALL):
         kind, body = block
@@ -66,40 +66,40 @@ def test_published_numbers_stand_in_tables_of_their_own(built):
     assert text.count("published, LM-O") >= 2  # theta and clusters, below their measured curves
 
 
-def test_what_a_run_says_is_text_and_no_markup(built):
+def test_texts_of_a_run_are_escaped(built):
     assert "needs 6 &lt;&amp;&gt;" in built[1]
 
 
-def test_runs_on_other_targets_have_a_part_of_their_own(rows, tmp_path):
+def test_runs_on_other_targets_have_their_own_section(runs, tmp_path):
     other = [toy_run(0.9, key="q" * 64, at=50, instances=21)]
-    found = sections_of([*rows, *other])
+    found = sections_of([*runs, *other])
     assert [len(section.runs) for section in found] == [1, 4]
     assert found[0].title.startswith("demo test: 21 targets")
     assert found[0].title.endswith("(qqqqqq)")
-    text = page([rows[0], *other], tmp_path)
+    text = page([runs[0], *other], tmp_path)
     assert "results are not compared across sections" in text
     assert text.count('<section id="d-') == 2
 
 
-def test_runs_that_differ_in_reported_thresholds_alone_are_shown_once(rows):
+def test_runs_that_differ_only_in_reported_thresholds_are_shown_once(runs):
     twins = [toy_run(0.5, evaluate__theta_max=bound) for bound in (0.1, 0.2)]
-    section = Section([*rows[:4], *twins], "demo")
+    section = Section([*runs[:4], *twins], "demo")
     assert len(section.runs) == 4
     assert len(section.jobs) == 6
 
 
-def test_a_random_models_notice_cannot_be_missed(built):
+def test_the_notice_of_random_weights_comes_before_all_tables(built):
     _, text = built
     assert text.index("random weights: nothing was learned") < text.index("<table>")
 
 
-def test_missing_vsd_is_told_and_never_a_zero(tmp_path):
+def test_missing_vsd_is_explained_and_not_shown_as_zero(tmp_path):
     text = page([toy_run(vsd=False)], tmp_path)
     assert "VSD, and with it BOP's AR, is not available: no depth" in re.sub(r"&#39;", "'", text)
     assert ">n/a<" in text
 
 
-def test_a_run_scored_on_other_meshes_is_shown_by_name_and_never_the_best():
+def test_a_run_scored_on_other_meshes_is_named_and_is_never_the_best():
     base = toy_run(0.5, evaluate={"models": "models_eval"})
     easier = toy_run(0.9, evaluate={"models": "models"})
     section = Section([base, toy_run(0.4, evaluate={"models": "models_eval"}, cluster__count=40), easier], "demo")
@@ -109,7 +109,7 @@ def test_a_run_scored_on_other_meshes_is_shown_by_name_and_never_the_best():
     assert len(Section(twins, "demo").runs) == 2
 
 
-def test_published_recalls_of_a_dataset_stand_beside_its_runs_marked_so(tmp_path):
+def test_published_recalls_of_a_dataset_are_marked_in_its_section(tmp_path):
     text = page([toy_run(name="lmo")], tmp_path)
     own = text[: text.index('<section id="published">')]
     assert own.count("AR of single-shot methods on LM-O") == 2  # caption and its label
@@ -120,7 +120,7 @@ def test_long_names_break_between_their_parts():
     assert str(_breakable("correspond.per_cluster=<3>")) == "correspond.<wbr>per_<wbr>cluster=<wbr>&lt;3&gt;"
 
 
-def test_rows_of_failures_alone_and_of_a_csv_still_make_a_page(tmp_path):
+def test_only_failures_or_a_scored_csv_still_make_a_page(tmp_path):
     assert "found -1" in page([failed_run()], tmp_path / "a")
     foreign = replace(toy_run(), config={}, label={}, times_s={}, counts={}, templates={}, method="megapose")
     text = page([foreign, toy_run()], tmp_path / "b")
@@ -128,18 +128,18 @@ def test_rows_of_failures_alone_and_of_a_csv_still_make_a_page(tmp_path):
 
 
 def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
-    rows = [toy_run(0.5, instances=1000)]
-    rows += [toy_run(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(20)]
+    runs = [toy_run(0.5, instances=1000)]
+    runs += [toy_run(0.4 + n / 1000, at=n, cluster__count=n + 1, instances=1000) for n in range(20)]
     noise = np.random.default_rng(0).integers(0, 256, (1058, 486, 3), dtype=np.uint8)  # compresses worse than any card
-    folder = tmp_path / rows[0].folder / "gallery"
+    folder = tmp_path / runs[0].folder / "gallery"
     folder.mkdir(parents=True)
     cases = []
     for n in range(60):
         Image.fromarray(np.roll(noise, n, axis=0)).save(folder / f"{n}.jpg", quality=82)
         cases.append(Case(f"gallery/{n}.jpg", 1, n, 1, 0.1, "score 0.50"))
-    rows[0] = replace(rows[0], cases=tuple(cases))
+    runs[0] = replace(runs[0], cases=tuple(cases))
     start = time.perf_counter()
-    report = write_report(rows, tmp_path)
+    report = write_report(runs, tmp_path)
     assert report.page.stat().st_size < LIMIT_BYTES
     assert time.perf_counter() - start < 60
     text = report.page.read_text()
@@ -148,7 +148,7 @@ def test_a_page_of_a_thousand_targets_and_many_runs_stays_below_15_mb(tmp_path):
     assert f"{60 - shown} pictures are not in this page" in text
 
 
-def test_an_oracle_is_never_the_base_nor_the_best_and_always_named(tmp_path):
+def test_an_oracle_is_never_base_or_best_and_is_always_named(tmp_path):
     oracle = {"_target_": "pipeline.stages.match.oracle.Oracle", "layer": 2, "top_k": 1}
     shown = [toy_run(0.9, variation="oracle_template", match=oracle), toy_run(0.95, match=oracle), toy_run(0.4)]
     section = Section(shown, "demo")
@@ -157,18 +157,18 @@ def test_an_oracle_is_never_the_base_nor_the_best_and_always_named(tmp_path):
     assert [section.name(row) for row in shown] == ["oracle template", "match=oracle", "dzop-hog"]
 
 
-def test_a_run_without_vsd_has_no_ar_beside_runs_that_have_one():
+def test_a_run_without_vsd_has_no_ar_among_runs_that_have_one():
     with_vsd, without = toy_run(0.4), toy_run(0.9, vsd=False, cluster__count=40)
     section = Section([with_vsd, without], "demo")
     assert section.best is with_vsd
     assert section.families == []
     table = section.tables()["runs"][0]
-    told = {row[0]: row[1] for row in table.rows}
-    assert told["cluster.count=40"].startswith("n/a; AR_MSSD+MSPD 0.")
+    cells = {row[0]: row[1] for row in table.rows}
+    assert cells["cluster.count=40"].startswith("n/a; AR_MSSD+MSPD 0.")
 
 
-def test_rows_on_disk_make_the_page(rows, tmp_path):
-    for row in (rows[0], rows[-1]):
+def test_a_page_is_made_from_records_on_disk(runs, tmp_path):
+    for row in (runs[0], runs[-1]):
         write_run_record(tmp_path, row)
     report = write_report(read_run_records(tmp_path), tmp_path)
     assert "1 runs; AR" in report.summary
@@ -177,11 +177,11 @@ def test_rows_on_disk_make_the_page(rows, tmp_path):
         read_run_records(tmp_path / "empty")
 
 
-def test_files_of_runs_that_are_gone_do_not_lie_beside_a_new_page(rows, tmp_path):
-    page(rows, tmp_path)
+def test_files_of_removed_runs_are_deleted_with_the_old_page(runs, tmp_path):
+    page(runs, tmp_path)
     drawn = {path.name for path in (tmp_path / "report").rglob("ablation_cluster_count.*")}
     assert {"ablation_cluster_count.csv", "ablation_cluster_count.tex"} <= drawn
-    page(rows[:1], tmp_path)
+    page(runs[:1], tmp_path)
     assert not list((tmp_path / "report").rglob("ablation_cluster_count.*"))
     assert list((tmp_path / "report" / "tables").rglob("runs.csv"))
 

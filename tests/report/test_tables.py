@@ -17,7 +17,7 @@ def columns(table: Table) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(table.csv())))
 
 
-def test_a_difference_is_paired_and_starred_when_it_is_more_than_chance():
+def test_a_difference_is_paired_and_starred_if_it_is_significant():
     base, better, same = toy_run(0.4), toy_run(0.6, cluster__count=40), toy_run(0.4, cluster__count=80)
     rows = {row["run"]: row for row in columns(tables.runs_table([base, better, same], base))}
     assert rows["dzop-hog"]["vs base"] == "base"
@@ -29,17 +29,17 @@ def test_a_difference_is_paired_and_starred_when_it_is_more_than_chance():
 
 def test_without_vsd_the_mean_of_two_is_not_called_ar():
     row = toy_run(vsd=False)
-    (told,) = columns(tables.runs_table([row], row))
-    assert "AR" not in told
-    assert told["AR_VSD"] == "n/a"
-    assert "AR_MSSD+MSPD" in told
+    (cells,) = columns(tables.runs_table([row], row))
+    assert "AR" not in cells
+    assert cells["AR_VSD"] == "n/a"
+    assert "AR_MSSD+MSPD" in cells
 
 
-def test_a_run_with_vsd_among_runs_without_shows_the_mean_of_two_under_that_name():
+def test_a_run_with_vsd_among_runs_without_shows_the_mean_of_two():
     base, other = toy_run(vsd=False), toy_run(cluster__count=40)
-    (_, told) = sorted(columns(tables.runs_table([base, other], base)), key=lambda row: row["run"], reverse=True)
-    assert told["run"] == "cluster.count=40"
-    assert told["AR_MSSD+MSPD"].split()[0] == f"{average_recall(other.scores).mssd_mspd:.3f}"
+    (_, cells) = sorted(columns(tables.runs_table([base, other], base)), key=lambda row: row["run"], reverse=True)
+    assert cells["run"] == "cluster.count=40"
+    assert cells["AR_MSSD+MSPD"].split()[0] == f"{average_recall(other.scores).mssd_mspd:.3f}"
 
 
 def test_no_table_calls_the_mean_of_two_ar():
@@ -84,7 +84,7 @@ def test_the_correspondence_table_has_the_papers_four_rows():
     assert correspondence_table([toy_run(), toy_run(cluster__count=40)]) is None
 
 
-def test_the_ladder_says_what_each_rung_gains():
+def test_the_ladder_shows_the_gain_of_each_step():
     oracle = {"_target_": "pipeline.stages.match.oracle.Oracle", "layer": 2, "top_k": 1}
     rows = [
         toy_run(0.2),
@@ -108,11 +108,11 @@ def test_improvements_are_relative_to_the_other_method():
     assert tables.improvement_table([("dzop-hog", ours)]) is None
 
 
-def test_jobs_say_what_they_computed_and_what_they_reused():
+def test_the_counts_table_shows_what_jobs_computed_and_reused():
     row = toy_run()
-    (told,) = columns(tables.counts_table([row], row))
-    assert told["template features"] == "0 + 900"
-    assert told["query features"] == "n/a"
+    (cells,) = columns(tables.counts_table([row], row))
+    assert cells["template features"] == "0 + 900"
+    assert cells["query features"] == "n/a"
 
 
 def test_every_csv_row_says_whether_it_was_measured_or_published():
@@ -124,7 +124,7 @@ def test_every_csv_row_says_whether_it_was_measured_or_published():
         assert {row["source"] for row in columns(table)} == {"measured"}
 
 
-def test_latex_escapes_what_it_would_read():
+def test_latex_special_characters_are_escaped():
     table = tables.failures_table([toy_run()], toy_run())
     assert r"<\&>" in table.latex()
     assert table.latex().count("&") - table.latex().count(r"\&") == 2 * 3

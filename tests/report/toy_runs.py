@@ -1,4 +1,4 @@
-"""Rows as runs leave them, with known scores, for tests of families, tables, figures and pages."""
+"""Run records with known scores, for tests of families, tables, figures and pages."""
 
 import copy
 from typing import Any

@@ -11,7 +11,7 @@ SEEDS = range(2 * len(FAMILIES))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_objects_are_closed_sized_and_the_same_every_time(seed):
+def test_objects_are_closed_have_the_right_size_and_are_reproducible(seed):
     mesh = make_object(seed)
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert solid.is_watertight
@@ -38,13 +38,13 @@ def test_no_rotation_maps_an_object_onto_itself(seed):
     apart = []
     for R in superfibonacci(400):
         if np.trace(R) > 1 + 2 * np.cos(np.radians(30)):
-            continue  # close to no rotation at all
+            continue  # almost the identity
         distance, index = tree.query(centred @ R.T)
         apart.append(distance.mean() + 0.2 * np.abs(colours - colours[index]).mean())
     assert min(apart) > 0.02
 
 
-def test_textures_have_contrast_all_over():
+def test_textures_have_contrast():
     for seed in SEEDS:
         colours = make_object(seed).colours.astype(float)
         assert colours.std(axis=0).max() > 25

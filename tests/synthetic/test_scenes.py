@@ -77,7 +77,7 @@ def test_ground_truth_is_exact(root):
     assert count == 12
 
 
-def test_half_of_the_instances_are_occluded_as_asked_and_the_others_free(root, tmp_path):
+def test_half_of_the_instances_are_occluded_as_requested_and_the_others_free(root, tmp_path):
     seen = np.array([info["visib_fract"] for *_, info, _ in instances(root)])
     hidden = (seen >= OCCLUDED[0]) & (seen <= OCCLUDED[1])
     assert hidden.sum() == 6
@@ -117,7 +117,7 @@ def test_models_info_targets_and_cameras_fit_the_files(root):
     assert len({tuple(camera["cam_K"]) for *_, camera in instances(root)}) == 4
 
 
-def test_a_folder_that_holds_something_is_left_alone(root):
+def test_a_folder_that_is_not_empty_is_refused_and_unchanged(root):
     before = sorted(p.name for p in root.iterdir())
     with pytest.raises(BadInput, match="needs a new or empty folder"):
         write_dataset(root, **SMALL)
@@ -151,7 +151,7 @@ def test_a_wrong_argument_is_named(changed, message, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_two_processes_that_ask_for_the_same_demo_at_once_both_get_it(tmp_path):
+def test_two_processes_can_open_the_same_demo_at_once(tmp_path):
     ask = (
         f"from pipeline.synthetic.demo import DemoConfig; print(len(DemoConfig(root={str(tmp_path)!r}).open().targets))"
     )
@@ -163,7 +163,7 @@ def test_two_processes_that_ask_for_the_same_demo_at_once_both_get_it(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1  # nothing half-written is left
 
 
-def test_a_demo_that_another_process_made_meanwhile_is_taken_and_anything_else_refused(tmp_path, monkeypatch):
+def test_a_demo_written_by_another_process_is_used_and_other_files_are_refused(tmp_path, monkeypatch):
     def late(root: Path, **chosen):
         write_dataset(root, **chosen)  # as the other process did
         write_dataset(root, **chosen)

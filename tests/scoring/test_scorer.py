@@ -18,7 +18,7 @@ def opened(root, name: str, models: str = "models_eval") -> Dataset:
 
 
 def true_rows(scorer: Scorer, *, symmetry: int | None = None) -> list[ResultRow]:
-    """Ground truth as results; ``symmetry``: turned by that symmetry of each object."""
+    """Ground truth as results; ``symmetry``: rotated by that symmetry of each object."""
     rows = []
     for target in scorer.targets:
         for gt in scorer.scored_instances(target):
@@ -30,7 +30,7 @@ def true_rows(scorer: Scorer, *, symmetry: int | None = None) -> list[ResultRow]
 
 @pytest.mark.parametrize("symmetry", [None, 1, 17])
 @pytest.mark.parametrize("name", ["lmo", "ycbv"])
-def test_ground_truth_scores_one_and_so_it_does_turned_by_a_symmetry(bop_mini, name, symmetry):
+def test_ground_truth_scores_one_also_when_rotated_by_a_symmetry(bop_mini, name, symmetry):
     data = opened(bop_mini / name, name)
     scorer = Scorer(data, data.targets, "models_eval")
     recall = average_recall(scorer.score(true_rows(scorer, symmetry=symmetry)).scores)
@@ -39,7 +39,7 @@ def test_ground_truth_scores_one_and_so_it_does_turned_by_a_symmetry(bop_mini, n
         assert recall.vsd == recall.ar == 1.0
 
 
-def test_missing_depth_images_leave_vsd_out_and_say_so(bop_mini):
+def test_without_all_depth_images_vsd_is_left_out_with_the_reason(bop_mini):
     data = opened(bop_mini / "lmo", "lmo")
     scorer = Scorer(data, data.targets, "models_eval")
     scored = scorer.score(true_rows(scorer))
@@ -57,7 +57,7 @@ def tiny(tmp_path) -> Scorer:
     return Scorer(data, data.targets, "models")
 
 
-def test_every_instance_of_a_target_is_found_by_an_estimate_of_its_own(tiny):
+def test_every_instance_of_a_target_needs_its_own_estimate(tiny):
     rows = true_rows(tiny)
     assert len(rows) == 4
     found = tiny.score(rows).scores
@@ -71,7 +71,7 @@ def test_every_instance_of_a_target_is_found_by_an_estimate_of_its_own(tiny):
     assert average_recall(twice).mspd == 0.75
 
 
-def test_only_as_many_estimates_count_as_a_target_asks_for(tiny):
+def test_only_inst_count_best_scored_estimates_count(tiny):
     rows = true_rows(tiny)
     wrong = rigid(Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.array([0.0, 0.0, 900.0]))
     better = [ResultRow(7, 3, 2, 2.0, wrong, -1.0), *rows]  # a higher score than the true one's
@@ -80,7 +80,7 @@ def test_only_as_many_estimates_count_as_a_target_asks_for(tiny):
     assert average_recall(tiny.score(worse).scores).mssd == 1.0
 
 
-def test_of_more_instances_than_asked_for_the_most_visible_count(tiny, tmp_path):
+def test_of_more_than_inst_count_instances_the_most_visible_count(tiny, tmp_path):
     edit_json(tmp_path / "tiny" / "test_targets_bop19.json", lambda targets: targets[0].update(inst_count=1))
     data = opened(tmp_path / "tiny", "tiny", "models")
     scorer = Scorer(data, data.targets, "models")
@@ -93,12 +93,12 @@ def test_of_more_instances_than_asked_for_the_most_visible_count(tiny, tmp_path)
         Scorer(data, data.targets, "models").score([])
 
 
-def test_no_estimate_is_a_miss_and_no_fault(tiny):
+def test_a_missing_estimate_is_a_miss_not_an_error(tiny):
     recall = average_recall(tiny.score([]).scores)
     assert (recall.vsd, recall.mssd, recall.mspd) == (0.0, 0.0, 0.0)
 
 
-def test_projection_errors_count_in_pixels_of_an_image_640_wide(tiny):
+def test_projection_errors_are_in_pixels_of_an_image_640_px_wide(tiny):
     row = true_rows(tiny)[3]
     T = row.T_cam_obj.copy()
     T[0, 3] += 10.0
@@ -109,7 +109,7 @@ def test_projection_errors_count_in_pixels_of_an_image_640_wide(tiny):
     assert errors.mssd_mm == pytest.approx(10.0)
 
 
-def test_turning_and_moving_the_camera_changes_no_distance(tiny):
+def test_errors_do_not_depend_on_the_camera_frame(tiny):
     """Errors in the object's frame do not depend on where the camera's axes point."""
     row = true_rows(tiny)[2]
     off = rigid(Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([3.0, -2.0, 5.0]))
@@ -122,7 +122,7 @@ def test_turning_and_moving_the_camera_changes_no_distance(tiny):
     assert errors.rotation_deg == pytest.approx(np.rad2deg(np.linalg.norm([0.1, 0.2, 0.3])))
 
 
-def test_another_annotation_is_another_dataset(tiny, tmp_path):
+def test_another_annotation_changes_the_digest(tiny, tmp_path):
     before = truth_digest(tiny)
     assert before == truth_digest(tiny)
     path = tmp_path / "tiny" / "test" / "000007" / "scene_gt.json"
