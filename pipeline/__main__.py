@@ -35,6 +35,7 @@ from pipeline.cli.sweep import FailedJobs, failures_text, record_failed_job
 from pipeline.configuration import CONF, PACKAGE, build_options, build_stages, build_variant, check_fields
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.checkpoints import offline
+from pipeline.io.digests import track_files
 from pipeline.run import make_report, run
 from pipeline.store import Store
 
@@ -144,7 +145,8 @@ def _run_job(config: DictConfig, *, resume: bool) -> None:
             raise BadInput("plan=true step=report", found="a step without a plan", needed="plan=false, or another step")
         make_report(values["out"])
         return
-    with offline() if values["plan"] is True else nullcontext():
+    # Building stages hashes weights already: the files of a run are tracked from here on.
+    with track_files(), offline() if values["plan"] is True else nullcontext():
         run(
             stages=build_stages(values),
             dataset=build_variant(values["dataset"], "dataset"),

@@ -21,6 +21,7 @@ from pydantic import Field
 
 from pipeline.errors import BadInput, DzopError
 from pipeline.graph import Context, Counts, Graph, use_threads
+from pipeline.io.digests import track_files, tracked_digests
 from pipeline.spec import NonNegative, Positive, Runtime, spec
 from pipeline.store import MemoryStoreConfig, Store
 
@@ -233,12 +234,14 @@ def _worker_setup(run: Context, runtime: RayRuntime, threads: int) -> dict[str, 
         "runtime": replace(local, progress=False),
         "threads": threads or runtime.cpus_per_actor,
         "folder": os.getcwd(),
+        "digests": tracked_digests(),
     }
 
 
-def _build_graph(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str) -> Graph:
+def _build_graph(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str, digests: dict[str, str]) -> Graph:
     if os.path.isdir(folder):
         os.chdir(folder)  # paths in the configuration may be relative
+    track_files(known=digests).__enter__()  # as long as this process lives: a worker serves one run
     use_threads(threads)
     stages, dataset, targets, store = run
     graph = Graph(Context(stages, dataset, targets, Store(store), runtime))

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from pipeline.bop.dataset import Dataset
+from pipeline.bop.results import results_name
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, plan_costs, plan_table, use_threads
 from pipeline.io.checkpoints import NotDownloaded
-from pipeline.io.digests import DigestCache, use_digest_cache
+from pipeline.io.digests import DigestCache, track_files
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import Answer
 from pipeline.method import Stages
@@ -46,16 +47,18 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     """Run one configuration and print what was done and where the results are. Raises DzopError."""
     start = time.perf_counter()
     use_threads(options.threads)
-    data = dataset.open()
-    context = Context(stages, data, options.select.targets(data), store, runtime, Progress(runtime.progress))
+    # Names that no results file can have are refused now, not when everything is computed.
+    results_name(options.name, getattr(dataset, "name", "data"), getattr(dataset, "split", "test"))
     folder = store.backend.folder
-    digests = None if folder is None else DigestCache(folder / ".digests")
-    with use_digest_cache(digests), runtime.workers(context, threads=options.threads) as context.workers:
-        graph = Graph(context)
-        if options.plan:
-            _print_plan(graph, options)
-            return
-        _run_step(graph, options)
+    with track_files(None if folder is None else DigestCache(folder / ".digests")):
+        data = dataset.open()
+        context = Context(stages, data, options.select.targets(data), store, runtime, Progress(runtime.progress))
+        with runtime.workers(context, threads=options.threads) as context.workers:
+            graph = Graph(context)
+            if options.plan:
+                _print_plan(graph, options)
+                return
+            _run_step(graph, options)
     seconds = time.perf_counter() - start
     print(f"\n{context.progress.table()}\n{'total':<20}{'':>20}{seconds:>10.1f}", flush=True)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from pipeline.errors import BadInput
@@ -43,6 +45,14 @@ def load_pretrained(class_name: str, root: Path, tensors: Sequence[Path], **opti
             f"{tensors[0]}, tensor {name}", found=tuple(stored), needed=f"{tuple(needed)}, as config.json says"
         )
     check_missing(sorted(info["missing_keys"]), tensors[0])
+    return _copy_to_memory(model)
+
+
+def _copy_to_memory(model: nn.Module) -> nn.Module:
+    """The model with memory of its own. transformers maps the file, so that writing to it would change the weights."""
+    with torch.no_grad():
+        for tensor in chain(model.parameters(), model.buffers()):
+            tensor.data = tensor.data.clone()
     return model
 
 

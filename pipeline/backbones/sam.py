@@ -9,6 +9,7 @@ from typing import Any
 from pipeline.backbones.pretrained import load_pretrained
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, is_local, read_json, sweep_hint
+from pipeline.io.digests import file_exists
 
 FIELD = "detect.proposals.weights"
 _NAME = "sam"  # of the field weights.sam in the configuration
@@ -31,8 +32,10 @@ class SamWeights:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Config and weight files, by name."""
-        return {path.name: path for path in [self.root / "config.json", *self.tensors]}
+        """Config and weight files, by name; the index where it says which file each tensor is in."""
+        index = [] if file_exists(self.root / "model.safetensors") else [self.root / "model.safetensors.index.json"]
+        named = [self.root / "config.json", *self.tensors, *filter(file_exists, index)]
+        return {path.name: path for path in named}
 
     def load_model(self) -> Any:
         """The model, float32 on the CPU. Raises BadInput for weights that do not fit the config."""

@@ -17,6 +17,7 @@ from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
 from pipeline.errors import BadInput
 from pipeline.functional.camera import project
 from pipeline.functional.rigid import transform
+from pipeline.io.digests import file_exists
 from pipeline.io.meshes import mesh_digest
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
@@ -148,7 +149,7 @@ class Dataset:
 
     def has_ground_truth(self, scene_id: int) -> bool:
         """Whether the scene is annotated."""
-        return (self.scene(scene_id).folder / "scene_gt.json").exists()
+        return file_exists(self.scene(scene_id).folder / "scene_gt.json")
 
     def ground_truth(self, scene_id: int, im_id: int) -> list[GroundTruth]:
         """Annotated instances in the order of scene_gt.json (index = gt_id), rotations as published."""
@@ -208,7 +209,7 @@ def open_dataset(
     _check_folder(root / models, "object models", lambda folder: any(folder.glob("obj_*.ply")))
     dataset = Dataset(name, root, split, models, read_models_info(root / models / "models_info.json"))
     path = None if targets is None else root / targets
-    if path is not None and path.exists():
+    if path is not None and file_exists(path):
         dataset = replace(dataset, targets=_read_targets(path))
     else:
         dataset = replace(dataset, targets=_list_annotated_targets(dataset))

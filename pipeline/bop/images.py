@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import PIL.Image
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.errors import BadInput
-from pipeline.io.files import IMAGE_FORMATS
+from pipeline.io.digests import unchanged_files
+from pipeline.io.files import IMAGE_FORMATS, read_file
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -62,7 +64,7 @@ _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 def image_size(path: Path) -> tuple[int, int]:
     """(h, w) of the upright image, from the file's header; the pixels are not read."""
     try:
-        with _open_header(path) as image:
+        with unchanged_files([path]), _open_header(path) as image:
             rotated_by_90 = _read_orientation(image) in (5, 6, 7, 8)
             return (image.width, image.height) if rotated_by_90 else (image.height, image.width)
     except _BROKEN as error:
@@ -86,7 +88,7 @@ def _open_header(path: Path) -> PIL.Image.Image:
 
 def _open(path: Path) -> PIL.Image.Image:
     try:
-        image = _open_header(path)
+        image = PIL.Image.open(io.BytesIO(read_file(path, "an image")), formats=IMAGE_FORMATS)
         image.load()  # PIL notices a truncated file only when it reads the pixels
     except _BROKEN as error:
         raise _unreadable_image(path, error) from None

@@ -15,6 +15,7 @@ from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_numbe
 from pipeline.bop.scene import describe_rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
+from pipeline.io.digests import file_exists
 from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
 
@@ -33,7 +34,7 @@ class ModelInfo:
 
 def read_models_info(path: Path) -> dict[int, ModelInfo]:
     """Entries by object id; empty if the file is missing (diameters are then measured on the meshes)."""
-    if not path.exists():
+    if not file_exists(path):
         return {}
     records = read_by_id(path).items()
     return {obj_id: _parse_model_info(record, describe_place(path, object=obj_id)) for obj_id, record in records}

@@ -19,6 +19,7 @@ from pipeline.items.poses import PoseEstimate
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _HEADER = ",".join(COLUMNS)
+_NAME_LENGTH = 80
 _TIME_TOLERANCE_S = 1e-3  # largest difference between the times of one image that bop_toolkit accepts
 
 
@@ -37,13 +38,13 @@ class ResultRow:
 def results_name(method: str, dataset: str, split: str = "test") -> str:
     """BOP's file name, ``<method>_<dataset>-<split>.csv``, without the split's sensor ("test_primesense" -> "test").
 
-    Raises BadInput for names with an underscore, where BOP's tools split the file name.
+    Raises BadInput for names with an underscore, where BOP's tools split the file name, and with characters that a
+    file system, a shell or a spreadsheet gives a meaning to.
     """
-    for field, name in (("method", method), ("dataset", dataset)):
-        if not name or any(c in "_/\\ \t\n" for c in name):
-            raise BadInput(
-                f"{field} name", found=repr(name), needed="letters, digits and hyphens, no underscore or space"
-            )
+    for field, name, others in (("method", method, ""), ("dataset.name", dataset, ""), ("dataset.split", split, "_")):
+        if not re.fullmatch(rf"[A-Za-z0-9][A-Za-z0-9.{others}-]{{0,{_NAME_LENGTH - 1}}}", name):
+            needed = f"at most {_NAME_LENGTH} letters, digits, dots and hyphens, the first a letter or digit"
+            raise BadInput(field, found=repr(name), needed=needed + ("" if others else ", no underscore"))
     return f"{method}_{dataset}-{split.split('_')[0]}.csv"
 
 

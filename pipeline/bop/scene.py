@@ -14,6 +14,7 @@ from jaxtyping import Float
 from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_integer, get_numbers, is_number, read_by_id
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
+from pipeline.io.digests import file_exists
 
 # Largest entry of |R R^T - I|. LM-O's published rotations reach 1e-2; rounding to three decimals gives 2e-3.
 ROTATION_TOLERANCE = 2e-2
@@ -72,7 +73,7 @@ class Scene:
     def annotation_infos(self) -> dict[int, Any]:
         """scene_gt_info.json by image, not validated; empty without the file."""
         path = self.folder / "scene_gt_info.json"
-        return read_by_id(path) if path.exists() else {}
+        return read_by_id(path) if file_exists(path) else {}
 
     def image_path(self, im_id: int) -> Path:
         """The image's file: rgb/ is preferred to gray/, png to jpg and tif. Raises BadInput."""
@@ -139,7 +140,7 @@ class Scene:
     def _find_file(self, patterns: tuple[str, ...], im_id: int, what: str) -> Path:
         candidates = [self.folder / pattern.format(im_id) for pattern in patterns]
         for path in candidates:
-            if path.exists():
+            if file_exists(path):
                 return path
         where = describe_place(self.folder, scene=self.scene_id, image=im_id)
         names = ", ".join(pattern.format(im_id) for pattern in patterns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from pipeline.errors import BadInput, DzopError
 from pipeline.graph.lru import LRUCache
 from pipeline.graph.tasks import Advance, Item, Task, Workers
 from pipeline.graph.timings import Timings, timing_key
+from pipeline.io.digests import unchanged_files
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crop, Crops, Target
 from pipeline.method import Stages
@@ -26,8 +27,17 @@ from pipeline.store import Layout, Ref, Store, make_ref
 
 MESHES_BYTES = 256 << 20  # limit of meshes in memory
 
+Loaded = TypeVar("Loaded", covariant=True)
 ImageId = tuple[int, int]
 """(scene_id, im_id)"""
+
+
+class Loadable(Protocol[Loaded]):
+    """A spec that has weights to load: an extractor or a proposer."""
+
+    def load(self, runtime: Runtime) -> Loaded:
+        """Weights into memory."""
+        ...
 
 
 @dataclass(eq=False)
@@ -61,18 +71,11 @@ class Context:
     @cached_property
     def models(self) -> LRUCache[int, ObjectModel]:
         """Meshes in memory, bounded so that memory does not grow with the number of objects."""
-        return LRUCache(self._read_model, _mesh_bytes, MESHES_BYTES)
+        return LRUCache(self.dataset.object_model, _mesh_bytes, MESHES_BYTES)
 
     def model(self, obj_id: int) -> ObjectModel:
         """Mesh and symmetries of an object."""
         return self.models(obj_id)
-
-    def _read_model(self, obj_id: int) -> ObjectModel:
-        model = self.dataset.object_model(obj_id)
-        if model.mesh.digest != self.mesh_digest(obj_id):
-            found = "a file that changed while the run was reading it"
-            raise BadInput(self.dataset.model_path(obj_id), found=found, needed="a mesh that no one writes to")
-        return model
 
     def mesh_digest(self, obj_id: int) -> str:
         """Digest of an object's mesh file, from which keys are made without parsing the mesh."""
@@ -88,7 +91,12 @@ class Context:
     @cached_property
     def backbone(self) -> Backbone:
         """The extractor with its weights, loaded when the first feature is missing."""
-        return self.stages.extract.load(self.runtime)
+        return self.load(self.stages.extract)
+
+    def load(self, weights: Loadable[Loaded]) -> Loaded:
+        """Load weights. Raises FileChanged if they are no longer, or do not stay, those that keys were made from."""
+        with unchanged_files():
+            return weights.load(self.runtime)
 
     @cached_property
     def device(self) -> str:

@@ -45,7 +45,7 @@ class ProposalNodes:
     @cached_property
     def proposer(self) -> LoadedProposer:
         """The proposer with its weights, loaded when the first image lacks proposals."""
-        return self.describer.proposer.load(self.context.runtime)
+        return self.context.load(self.describer.proposer)
 
     def check(self) -> None:
         """Raise BadInput for missing weights, a missing layer, and an extractor that needs the true pose."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput
+from pipeline.io.files import read_file
 
 PICKLES = (".bin", ".ckpt", ".pt", ".pth")
 _offline: ContextVar[bool] = ContextVar("offline", default=False)
@@ -104,8 +105,8 @@ def check_missing(names: Sequence[str], where: Path) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON file's object. Raises BadInput."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        value = json.loads(read_file(path, "valid JSON"))
+    except (ValueError, RecursionError) as error:
         raise BadInput(path, found=first_line(error), needed="valid JSON") from None
     if not isinstance(value, dict):
         raise BadInput(path, found=type(value).__name__, needed="a JSON object")

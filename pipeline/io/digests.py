@@ -1,19 +1,60 @@
-"""SHA-256 digests of files. Every cache key is derived from them."""
+"""SHA-256 digests of files, from which every cache key is made, and a watch on files that change during a run.
+
+A key is made from a file at one moment and its content is read at another. Inside ``track_files`` every file has one
+digest from its first use on, whether it was hashed for a key or read (``io.files.read_file``). Whatever differs later
+raises FileChanged, so that no result of new content is stored under the key of the old one. Libraries that open files
+themselves run inside ``unchanged_files``.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, DzopError
 
-_LARGE_BYTES = 1 << 26  # smaller files are hashed again every time
+_LARGE_BYTES = 1 << 26  # digests of smaller files are not kept on disk
+# Two writes within one tick of a file system's clock leave the same times: up to 2 s on FAT, 1 s on some NFS.
+_SETTLED_NS = 2_500_000_000
+_ABSENT = "no such file"
+
+
+class FileChanged(DzopError):
+    """A file changed after the run made a key from it or read it."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__(
+            f"{path}: found a file that changed during the run, needs one that no one writes to; run again"
+        )
+
+
+@dataclass(frozen=True)
+class FileState:
+    """What changes with every write of a file. ``settled``: so old that a later write has another time."""
+
+    size: int
+    inode: int
+    mtime_ns: int
+    ctime_ns: int
+    settled: bool
+
+    @classmethod
+    def of(cls, path: str) -> FileState:
+        """The file's state now. Raises OSError."""
+        now, stat = time.time_ns(), os.stat(path)
+        settled = stat.st_ctime_ns < now - _SETTLED_NS  # the kernel sets the ctime; the mtime may be any
+        return cls(stat.st_size, stat.st_ino, stat.st_mtime_ns, stat.st_ctime_ns, settled)
+
+    def is_same(self, before: FileState) -> bool:
+        """Whether nothing was written since ``before``, which must have been settled to be sure."""
+        now = (self.size, self.inode, self.mtime_ns, self.ctime_ns)
+        return now == (before.size, before.inode, before.mtime_ns, before.ctime_ns)
 
 
 @dataclass(frozen=True)
@@ -25,68 +66,179 @@ class DigestCache:
 
     folder: Path
 
-    def load(self, path: Path, stat: os.stat_result) -> str | None:
-        """The file's sha256 (hex), None if it is not cached."""
-        entry = self._entry(path, stat)
-        if not entry.exists():
+    def load(self, path: Path, state: FileState) -> str | None:
+        """The file's sha256 (hex), None if it is not cached or what is cached is damaged."""
+        identity = _identity(path, state)
+        try:
+            entry = json.loads(self._entry(identity).read_text())
+            digest = str(entry["sha256"])
+            return digest if entry["check"] == _check(identity, digest) else None
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
-        digest = json.loads(entry.read_text()).get("sha256", "")
-        return str(digest) if len(digest) == 64 else None
 
-    def save(self, path: Path, stat: os.stat_result, digest: str) -> None:
+    def save(self, path: Path, state: FileState, digest: str) -> None:
         """Cache a digest. A folder that cannot be written is ignored: the next run hashes the file again."""
-        entry = self._entry(path, stat)
+        identity = _identity(path, state)
+        entry = self._entry(identity)
         partial = entry.with_suffix(f".{os.getpid()}.partial")
+        record = {"path": str(path.resolve()), "sha256": digest, "check": _check(identity, digest)}
         try:
             entry.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_text(json.dumps({"path": str(path.resolve()), "sha256": digest}))
+            partial.write_text(json.dumps(record))
             partial.replace(entry)
         except OSError:
             return
 
-    def _entry(self, path: Path, stat: os.stat_result) -> Path:
-        identity = f"{path.resolve()}\0{stat.st_size}\0{stat.st_ino}\0{stat.st_mtime_ns}\0{stat.st_ctime_ns}"
+    def _entry(self, identity: str) -> Path:
         return self.folder / f"{sha256(identity.encode()).hexdigest()}.json"
 
 
-_active_cache: ContextVar[DigestCache | None] = ContextVar("digest_cache", default=None)
+def _identity(path: Path, state: FileState) -> str:
+    return f"{path.resolve()}\0{state.size}\0{state.inode}\0{state.mtime_ns}\0{state.ctime_ns}"
+
+
+def _check(identity: str, digest: str) -> str:
+    """Checksum of a cached digest: a file cut off or zeroed by a power failure is never believed."""
+    return sha256(f"{identity}\0{digest}".encode()).hexdigest()
+
+
+@dataclass(eq=False)
+class TrackedFiles:
+    """Digests of the files that a run has used, by absolute path; ``_ABSENT`` for a file that it found missing.
+
+    ``cache`` keeps digests of large files from run to run, None keeps none.
+    """
+
+    cache: DigestCache | None = None
+    digests: dict[str, str] = field(default_factory=dict)
+    _states: dict[str, FileState] = field(default_factory=dict, repr=False)
+
+    def digest(self, path: Path) -> str:
+        """sha256 (hex) of the file. Raises FileChanged, and OSError where it cannot be read."""
+        name = os.path.abspath(path)
+        try:
+            state = FileState.of(name)
+        except FileNotFoundError:
+            self.record(name, _ABSENT)
+            raise
+        known = self._states.get(name)
+        if known is None or not known.settled or not state.is_same(known):
+            self.record(name, _digest_of(path, state, self.cache))
+            self._states[name] = state
+        return self.digests[name]
+
+    def record(self, name: str, digest: str) -> None:
+        """Record the digest of a file. Raises FileChanged if it was another one before."""
+        if self.digests.setdefault(name, digest) != digest:
+            raise FileChanged(name)
+
+    @contextmanager
+    def unchanged(self, paths: Sequence[Path] | None) -> Iterator[None]:
+        """As ``unchanged_files``."""
+        names = list(self.digests) if paths is None else [os.path.abspath(path) for path in paths]
+        known = [name for name in names if self.digests.get(name, _ABSENT) != _ABSENT]
+        before = {name: self._verify(name) for name in known}
+        yield
+        for name, state in before.items():
+            if not self._verify(name).is_same(state):
+                raise FileChanged(name)
+
+    def _verify(self, name: str) -> FileState:
+        """The state of a file that has the recorded digest. Raises FileChanged."""
+        try:
+            state = FileState.of(name)
+            self.digest(Path(name))
+        except OSError:
+            raise FileChanged(name) from None
+        return state
+
+
+_tracked: TrackedFiles | None = None
 
 
 @contextmanager
-def use_digest_cache(cache: DigestCache | None) -> Iterator[None]:
-    """Let ``file_digest`` use this cache inside the block (None: hash every file)."""
-    previous = _active_cache.set(cache)
+def track_files(cache: DigestCache | None = None, known: Mapping[str, str] | None = None) -> Iterator[TrackedFiles]:
+    """Watch the files of one run. ``known``: digests by absolute path that another process of this run has recorded.
+
+    A block inside another joins it.
+    """
+    global _tracked
+    if _tracked is not None:
+        _tracked.cache = _tracked.cache or cache
+        yield _tracked
+        return
+    _tracked = TrackedFiles(cache, dict(known or {}))
     try:
-        yield
+        yield _tracked
     finally:
-        _active_cache.reset(previous)
+        _tracked = None
+
+
+def tracked_digests() -> dict[str, str]:
+    """Digests recorded so far, by absolute path; empty outside ``track_files``."""
+    return {} if _tracked is None else dict(_tracked.digests)
+
+
+@contextmanager
+def unchanged_files(paths: Sequence[Path] | None = None) -> Iterator[None]:
+    """Raise FileChanged if one of the files (None: any file used so far) changed since, or changes inside the block.
+
+    Files that were neither hashed nor read before are not checked, and outside ``track_files`` none is.
+    """
+    if _tracked is None:
+        yield
+        return
+    with _tracked.unchanged(paths):
+        yield
+
+
+def record_content(path: Path, content: bytes) -> None:
+    """Record what was read from a file. Raises FileChanged if a key was made from other content."""
+    if _tracked is not None:
+        _tracked.record(os.path.abspath(path), sha256(content).hexdigest())
+
+
+def file_exists(path: Path) -> bool:
+    """Whether there is such a file. Raises FileChanged if it was there before and is not now, or the other way round.
+
+    Use it where a missing file is not an error but leads to other results.
+    """
+    exists = path.exists()
+    if _tracked is not None:
+        name = os.path.abspath(path)
+        if not exists:
+            _tracked.record(name, _ABSENT)
+        elif _tracked.digests.get(name) == _ABSENT:
+            raise FileChanged(name)
+    return exists
 
 
 def file_digest(path: Path) -> str:
-    """sha256 (hex) of a file's bytes. Raises BadInput when it cannot be read."""
+    """sha256 (hex) of a file's bytes. Raises BadInput when it cannot be read, FileChanged inside ``track_files``."""
     try:
-        stat = path.stat()
-        cache = _active_cache.get() if stat.st_size >= _LARGE_BYTES else None
-        digest = cache.load(path, stat) if cache else None
-        if digest is None:
-            digest = _hash(path)
-            if cache:
-                cache.save(path, stat, digest)
+        return _digest_of(path, FileState.of(str(path)), None) if _tracked is None else _tracked.digest(path)
     except (OSError, ValueError) as error:
         found = error.strerror if isinstance(error, OSError) else error
         raise BadInput(path, found=found, needed="a readable file") from None
-    return digest
 
 
-def files_digest(paths: dict[str, Path]) -> str:
+def files_digest(paths: Mapping[str, Path]) -> str:
     """sha256 (hex) of several files and their names; independent of their order and location."""
     lines = "".join(f"{name}\0{file_digest(path)}\n" for name, path in sorted(paths.items()))
     return sha256(lines.encode()).hexdigest()
 
 
-def _hash(path: Path) -> str:
+def _digest_of(path: Path, state: FileState, cache: DigestCache | None) -> str:
+    """sha256 (hex) of a file; that of a large one is looked up in the cache, and kept there once it is settled."""
+    usable = cache if cache and state.settled and state.size >= _LARGE_BYTES else None
+    found = usable.load(path, state) if usable else None
+    if found is not None:
+        return found
     hasher = sha256()
     with path.open("rb") as stream:
         while block := stream.read(1 << 22):
             hasher.update(block)
-    return hasher.hexdigest()
+    digest = hasher.hexdigest()
+    if usable and FileState.of(str(path)).is_same(state):
+        usable.save(path, state, digest)
+    return digest

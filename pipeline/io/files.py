@@ -9,17 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput, DzopError
+from pipeline.io.digests import file_exists, record_content
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "TGA")
 """The only formats opened as images. Pillow runs PostScript files through an external interpreter, so they stay out."""
 
 
 def read_file(path: Path, needed: str) -> bytes:
-    """Bytes of a regular file. Raises BadInput for anything else: reading a pipe or a device may never end."""
+    """Bytes of a regular file. Raises BadInput for anything else: reading a pipe or a device may never end.
+
+    Inside ``track_files`` raises FileChanged if the run has made a key from, or read, other content of this file.
+    """
     try:
-        if path.exists() and not path.is_file():
+        if file_exists(path) and not path.is_file():
             raise BadInput(path, found="not a regular file", needed=needed)
-        return path.read_bytes()
+        content = path.read_bytes()
+        record_content(path, content)
+        return content
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
         found = "no such file" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", error)
         raise BadInput(path, found=found, needed=needed) from None

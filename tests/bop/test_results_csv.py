@@ -109,7 +109,17 @@ def test_file_name_follows_bop():
     assert results_name("dzop-x", "tless", "test_primesense") == "dzop-x_tless-test.csv"
 
 
-@pytest.mark.parametrize(("method", "dataset"), [("dzop_x", "lmo"), ("dzop", "lm_o"), ("", "lmo"), ("a/b", "lmo")])
-def test_underscore_in_a_name_is_refused(method: str, dataset: str):
-    with pytest.raises(BadInput, match="no underscore"):
-        results_name(method, dataset)
+@pytest.mark.parametrize(
+    "name", ["lm_o", "", "a/b", "=cmd|calc!A0", "-x", "..", "a\0b", "a\nb", "ü", "a" * 81, "$(id)"]
+)
+def test_unsafe_name_is_refused(name: str):
+    with pytest.raises(BadInput, match=r"^method: found .*no underscore"):
+        results_name(name, "lmo")
+    with pytest.raises(BadInput, match=r"^dataset\.name: found .*no underscore"):
+        results_name("dzop", name)
+
+
+@pytest.mark.parametrize("split", ["", "../test", "test/a", "=1+1", ".", "test test"])
+def test_unsafe_split_is_refused(split: str):
+    with pytest.raises(BadInput, match=r"^dataset\.split: found"):
+        results_name("dzop", "lmo", split)

@@ -12,7 +12,7 @@ from helpers import Inputs, Reference, read_entries, read_results, store_of
 
 import pipeline.io.digests
 import pipeline.store.completion
-from pipeline.io.digests import DigestCache, file_digest, use_digest_cache
+from pipeline.io.digests import DigestCache, file_digest, track_files
 from pipeline.store.admin import collect_garbage, list_entries
 
 
@@ -149,13 +149,15 @@ def test_entries_completed_in_the_future_are_not_old(reference: Reference, folde
 
 def test_a_file_changed_without_a_new_mtime_has_another_digest(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(pipeline.io.digests, "_LARGE_BYTES", 1)
+    monkeypatch.setattr(pipeline.io.digests, "_SETTLED_NS", 0)
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"one")
-    with use_digest_cache(DigestCache(tmp_path / "memo")):
+    with track_files(DigestCache(tmp_path / "memo")):
         first, stat = file_digest(path), path.stat()
         assert list((tmp_path / "memo").iterdir())
         time.sleep(0.02)  # the kernel sets the ctime from its clock; no call can put it back
         path.write_bytes(b"two")
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         assert path.stat().st_mtime_ns == stat.st_mtime_ns
+    with track_files(DigestCache(tmp_path / "memo")):
         assert file_digest(path) != first

@@ -29,10 +29,14 @@ from pipeline.backbones.stable_diffusion.loading import (
 )
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, first_line, list_pickles, list_shards, read_json
+from pipeline.io.digests import file_exists
 
 FIELD = "extract.weights"
 NAME = "stable_diffusion"  # of the field weights.stable_diffusion in the configuration
-_TOKENIZER_FILES = ("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
+_TOKENIZER_FILES = (
+    *("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json"),
+    *("special_tokens_map.json", "added_tokens.json"),
+)
 _STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
 
 
@@ -44,12 +48,13 @@ class DiffusersFolder:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Configs and weights that are read; other files in the folder do not matter."""
+        """Configs and weights that are read, and all files of the tokenizer: transformers decides which it reads."""
         paths = [self._json(part) for part in _STEMS]
         paths += [path for part in _STEMS for path in self._tensors(part)]
         paths += [self.root / "scheduler" / "scheduler_config.json"]
         paths += [self.root / "tokenizer" / name for name in _TOKENIZER_FILES]
-        return {path.relative_to(self.root).as_posix(): path for path in paths if path.exists()}
+        paths += [path for path in (self.root / "tokenizer").glob("[!.]*") if path.is_file()]
+        return {path.relative_to(self.root).as_posix(): path for path in paths if file_exists(path)}
 
     def read_configs(self) -> DiffusionConfigs:
         """See Weights."""
@@ -64,7 +69,7 @@ class DiffusersFolder:
         check_latents(unet, vae, self._json("unet"))
         scheduler = self.root / "scheduler" / "scheduler_config.json"
         return DiffusionConfigs(
-            unet, vae, alphas_cumprod(read_json(scheduler) if scheduler.exists() else {}, scheduler)
+            unet, vae, alphas_cumprod(read_json(scheduler) if file_exists(scheduler) else {}, scheduler)
         )
 
     def load_unet(self, dtype: torch.dtype) -> nn.Module:
@@ -92,7 +97,7 @@ class DiffusersFolder:
 
     def _token_ids(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
         folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
-        if not any((folder / name).exists() for name in ("vocab.json", "tokenizer.json")):
+        if not any(file_exists(folder / name) for name in ("vocab.json", "tokenizer.json")):
             return tokenize_empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
         from transformers import CLIPTokenizer
 
@@ -123,9 +128,9 @@ class DiffusersFolder:
         folder, stem = self.root / part, _STEMS[part]
         for variant in ("", ".fp16"):
             index = folder / f"{stem}.safetensors.index{variant}.json"
-            if (single := folder / f"{stem}{variant}.safetensors").exists():
+            if file_exists(single := folder / f"{stem}{variant}.safetensors"):
                 return [single]
-            if index.exists():
+            if file_exists(index):
                 return [index, *list_shards(index)]
         pickled = list_pickles(folder)
         found = f"only {', '.join(pickled)}" if pickled else "no such file"

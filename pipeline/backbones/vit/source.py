@@ -12,6 +12,7 @@ from torch import nn
 from pipeline.backbones.pretrained import full_text, load_pretrained, silence_libraries
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, is_local, list_pickles, list_shards, read_json, sweep_hint
+from pipeline.io.digests import file_exists
 
 FIELD = "extract.weights"
 CLASSES = {
@@ -110,9 +111,9 @@ class TransformersFolder:
 
     def _list_tensors(self) -> list[Path]:
         """One weight file, or an index and its shards."""
-        if (self.root / _SINGLE).exists():
+        if file_exists(self.root / _SINGLE):
             return [self.root / _SINGLE]
-        if (self.root / _INDEX).exists():
+        if file_exists(self.root / _INDEX):
             return [self.root / _INDEX, *list_shards(self.root / _INDEX)]
         pickled = list_pickles(self.root)
         found = f"only {', '.join(pickled)}" if pickled else "no such file"

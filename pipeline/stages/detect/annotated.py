@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.scene import GroundTruth
+from pipeline.io.digests import file_exists
 from pipeline.items.views import Target
 
 
@@ -20,7 +21,7 @@ def annotation_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
     """scene_gt.json and, where it exists, scene_gt_info.json of the targets' scenes."""
     folders = [dataset.scene(scene_id).folder for scene_id in sorted({target.scene_id for target in targets})]
     infos = [folder / "scene_gt_info.json" for folder in folders]
-    return [folder / "scene_gt.json" for folder in folders] + [path for path in infos if path.exists()]
+    return [folder / "scene_gt.json" for folder in folders] + [path for path in infos if file_exists(path)]
 
 
 def image_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:

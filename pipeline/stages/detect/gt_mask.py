@@ -11,6 +11,7 @@ from pipeline.bop.masks import encode_rle
 from pipeline.bop.scene import GroundTruth
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
+from pipeline.io.digests import file_exists
 from pipeline.items.views import Detection, Target
 from pipeline.spec import spec
 from pipeline.stages.detect import Descriptors, Detector
@@ -38,7 +39,7 @@ class GtMask(Detector):
             for gt in select_instances(dataset, target)
         ]
         files = annotation_paths(dataset, targets) + image_paths(dataset, targets)
-        return files + [path for path in masks if path.exists()]
+        return files + [path for path in masks if file_exists(path)]
 
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None

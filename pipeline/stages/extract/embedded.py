@@ -31,6 +31,7 @@ from pipeline.backbones.stable_diffusion.noise import NoiseMode
 from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES, ORIENTATIONS, edge_histograms
 from pipeline.io.digests import file_digest
+from pipeline.io.files import read_file
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, digest, spec
@@ -93,7 +94,7 @@ class Embedded(DiffusionFeatures):
         path = FOLDER / "config.json"
         if not path.exists():
             raise BadInput(path, found="nothing", needed="the embedded model (make train-embedded), or another extract")
-        config = json.loads(path.read_text())
+        config = json.loads(read_file(path, "the embedded model's config"))
         return DiffusionConfigs(config["unet"], config["vae"], alphas_cumprod(config["scheduler"]))
 
     def load_model(self) -> LoadedModel:
@@ -137,9 +138,10 @@ def _decoder_layers(layers: Sequence[int]) -> list[int]:
 
 
 def _load_weights(model: nn.Module, path: Path) -> nn.Module:
-    from safetensors.torch import load_file
+    from safetensors.torch import load
 
     wanted = model.state_dict()
-    stored = {name: tensor for name, tensor in load_file(path).items() if name in wanted}
+    content = read_file(path, "the embedded model's weights")
+    stored = {name: tensor for name, tensor in load(content).items() if name in wanted}
     model.load_state_dict({name: tensor.to(wanted[name].dtype) for name, tensor in stored.items()})
     return model

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,7 +13,8 @@ from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
 from pipeline.functional.gradients import EDGES, append_edges
 from pipeline.functional.masks import cell_mask
-from pipeline.io.digests import file_digest
+from pipeline.io.digests import FileChanged, file_digest
+from pipeline.io.files import read_file
 from pipeline.items.features import CropFeatures, FittedArrays, FusedPair
 from pipeline.spec import PositiveFloat, spec
 from pipeline.stages.fuse import EncodedMap, Fuser, Layers, pair_encoded
@@ -53,14 +55,20 @@ class Learned(Fuser[EncodedMap]):
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the digest of the head's weights; ``edges`` does not count where there are none."""
-        known = super().recipe() | {"weights": _digest()}
+        known = super().recipe() | {"weights": self.weights_digest}
         return known if EDGES in self.layers else known | {"edges": 0.0}
+
+    @cached_property
+    def weights_digest(self) -> str:
+        """sha256 of the head's weights. Raises BadInput if they are missing."""
+        _require_head()
+        return file_digest(HEAD)
 
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> EncodedMap:
         """The head's map, with the gradient histograms beside it."""
         maps = {layer: crop.maps[layer][None].float() for layer in self.layers}
         with torch.no_grad():
-            described = _head(maps[self.layers[0]].device)(maps)
+            described = _head(maps[self.layers[0]].device, self.weights_digest)(maps)
             if EDGES in maps:
                 described = append_edges(described, maps[EDGES], weight=self.edges)
         return EncodedMap(described[0], cell_mask(crop.mask, cells=described.shape[-1]))
@@ -71,21 +79,18 @@ class Learned(Fuser[EncodedMap]):
 
 
 @lru_cache(maxsize=2)
-def _head(device: torch.device) -> Aggregation:
-    from safetensors.torch import load_file
+def _head(device: torch.device, weights_digest: str) -> Aggregation:
+    """The head with the weights of this digest. Raises FileChanged if its file has others."""
+    from safetensors.torch import load
 
-    _require_head()
-    state = {name: tensor.float() for name, tensor in load_file(HEAD).items()}
+    content = read_file(HEAD, "the embedded model's head")
+    if sha256(content).hexdigest() != weights_digest:
+        raise FileChanged(str(HEAD))
+    state = {name: tensor.float() for name, tensor in load(content).items()}
     channels = {layer: state[f"mix.{k}.weight"].shape[1] for k, layer in enumerate(LAYERS)}
     head = Aggregation(channels, state["narrow.weight"].shape[0])
     head.load_state_dict(state)
     return head.eval().requires_grad_(False).to(device)
-
-
-@lru_cache(maxsize=1)
-def _digest() -> str:
-    _require_head()
-    return file_digest(HEAD)
 
 
 def _require_head() -> None:
