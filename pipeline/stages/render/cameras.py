@@ -1,4 +1,4 @@
-"""mesh -> the cameras of its templates: the fields that all renderers share."""
+"""mesh -> the cameras of its templates: the base of all renderers, with their common fields."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.stages.render import Renderer
 
 @spec
 class RenderSpec(Renderer):
-    """Where the cameras stand and how the light falls. Every field is explained in conf/render."""
+    """Cameras and light of the templates. Every field is explained in conf/render."""
 
     viewpoints: ViewpointSet = "fibonacci"
     count: Annotated[int, Field(ge=1, le=100_000)] = 300
@@ -33,8 +33,9 @@ class RenderSpec(Renderer):
     def cameras(self, mesh: Mesh) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 4 4"], tuple[int, int]]:
         """K, T_cam_obj of all templates, and the image size (h, w).
 
-        All look at the centre of the mesh's bounding box, wherever its origin lies, from ``distance`` diameters of
-        the sphere around it, whose outline fills ``fill`` of the image's side: K is the same for every object.
+        All cameras look at the centre of the mesh's bounding box, wherever its origin is, from a distance of
+        ``distance`` diameters of its bounding sphere. The sphere's outline spans ``fill`` of the image, so that K is
+        the same for every object.
         """
         centre, radius = bounding_sphere(mesh)
         R = viewpoint_rotations(self.viewpoints, self.count, self.inplane)
@@ -54,13 +55,13 @@ def bounding_sphere(mesh: Mesh) -> tuple[Float[np.ndarray, " 3"], float]:
 
 
 def face_vertices(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """The vertices that a face uses: scans keep stray points, which are not drawn."""
+    """The vertices that faces use; scans often contain stray points, which are not rendered."""
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[mesh.faces] = True
     return mesh.vertices[used]
 
 
 def subpixels(supersample: int) -> Float[np.ndarray, "s 2"]:
-    """Offsets (x, y) of a pixel's samples from its centre: the centres of a grid of equal cells, row by row."""
+    """Offsets (x, y) of a pixel's samples from its centre: centres of a grid of equal cells, in row-major order."""
     steps = (np.arange(supersample) + 0.5) / supersample - 0.5
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

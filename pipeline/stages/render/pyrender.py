@@ -1,7 +1,7 @@
-"""mesh -> templates, by OpenGL through EGL (pyrender): no display, but the system's GL libraries.
+"""mesh -> templates, by OpenGL through EGL (pyrender): needs no display, but the system's GL libraries.
 
-pyrender draws albedo, object normals (as colours) and depth unlit; the light is then the same arithmetic as the ray
-caster's. Depth comes from a pass without multisampling, which alone has its samples at the pixels' centres.
+pyrender draws albedo, object normals (as colours) and depth without light; shading is then the same computation as the
+ray caster's. Depth comes from a pass without multisampling, whose samples are at the pixels' centres.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera looks along -z 
 
 @spec
 class Pyrender(RenderSpec):
-    """Templates drawn by pyrender. Fields: conf/render/pyrender.yaml."""
+    """Templates rendered by pyrender. Fields: conf/render/pyrender.yaml."""
 
     kind: ClassVar[str] = "render.pyrender"
     version: ClassVar[int] = 1
@@ -36,22 +36,22 @@ class Pyrender(RenderSpec):
     def render(
         self, mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "n 4 4"], size_hw: tuple[int, int]
     ) -> tuple[UInt8[np.ndarray, "n H W 3"], Float32[np.ndarray, "n H W"]]:
-        """Colour and depth (mm) of the given views; rgb is black where depth is 0."""
+        """As Renderer.render."""
         rgb = np.zeros((len(T_cam_obj), *size_hw, 3), dtype=np.uint8)
         depth_mm = np.zeros((len(T_cam_obj), *size_hw), dtype=np.float32)
         K_fine = resize_affine(float(self.supersample)) @ K
-        with _canvas(mesh, self.crease_deg) as canvas:
+        with _open_canvas(mesh, self.crease_deg) as canvas:
             for i, T in enumerate(T_cam_obj):
                 depth_mm[i] = canvas.depth_mm(K, T, size_hw)
-                total, covered = self._colour(canvas, K, T, size_hw, 1)
+                total, covered = self._shade(canvas, K, T, size_hw, 1)
                 if self.supersample > 1:
-                    fine, fine_covered = self._colour(canvas, K_fine, T, size_hw, self.supersample)
+                    fine, fine_covered = self._shade(canvas, K_fine, T, size_hw, self.supersample)
                     total, covered = total + fine, covered + fine_covered
                 mean = np.rint(np.clip(total / np.maximum(covered, 1e-6), 0, 255))
                 rgb[i] = np.where(depth_mm[i][..., None] > 0, mean, 0)
         return rgb, depth_mm
 
-    def _colour(
+    def _shade(
         self,
         canvas: _Canvas,
         K: Float[np.ndarray, "3 3"],
@@ -59,11 +59,11 @@ class Pyrender(RenderSpec):
         size_hw: tuple[int, int],
         s: int,
     ) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W 1"]]:
-        """Per pixel the sum over its s x s samples of colour times coverage, and of coverage."""
+        """Sums over the s x s samples of each pixel: of colour times coverage, and of coverage."""
         h, w = size_hw[0] * s, size_hw[1] * s
         albedo, normal = canvas.albedo_and_normal(K, T_cam_obj, (h, w))
         covered = albedo[..., 3:] / 255.0
-        # colours come blended with black at the outline; the coverage undoes that
+        # colours are blended with black at the outline; dividing by the coverage reverses that
         albedo, normal = (layer[..., :3] / np.maximum(layer[..., 3:], 1.0) for layer in (albedo, normal))
         px = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1)
         A = T_cam_obj[:3, :3].T @ np.linalg.inv(K)
@@ -74,9 +74,9 @@ class Pyrender(RenderSpec):
 
 
 class _Canvas:
-    """A mesh in an OpenGL context three times: with its skin, with its normals as colours, and bare, for depth.
+    """A mesh in an OpenGL context three times: with its albedo, with its normals as colours, and plain, for depth.
 
-    Vertices are relative to the centre of the mesh, as they are in the ray caster.
+    Vertices are relative to the centre of the mesh, as in the ray caster.
     """
 
     def __init__(self, gl: Any, mesh: Mesh, crease_deg: float) -> None:
@@ -84,10 +84,10 @@ class _Canvas:
         self.centre, self.radius = bounding_sphere(mesh)
         self.scene = gl.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
         local = mesh.vertices - self.centre
-        self.skin = self.scene.add(gl.Mesh([_skin(gl, mesh, local)]))
-        # pyrender culls back faces in its segmentation pass, the one for depth: each face is there both ways round
+        self.albedo = self.scene.add(gl.Mesh([_albedo_primitive(gl, mesh, local)]))
+        # pyrender culls back faces in its segmentation pass, used for depth, so each face is added in both orientations
         both_sides = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
-        self.bare = self.scene.add(gl.Mesh([gl.Primitive(local, indices=both_sides)]))
+        self.plain = self.scene.add(gl.Mesh([gl.Primitive(local, indices=both_sides)]))
         corners = local[mesh.faces].reshape(-1, 3)
         coded = (corner_normals(mesh.vertices, mesh.faces, crease_deg=crease_deg).reshape(-1, 3) + 1) / 2
         opaque = np.concatenate([coded, np.ones((len(coded), 1))], axis=-1).astype(np.float32)
@@ -100,32 +100,32 @@ class _Canvas:
     ) -> Float32[np.ndarray, "H W"]:
         """Depth at pixel centres."""
         self._aim(K, T_cam_obj, size_hw)
-        self._show(self.bare)
-        colour = {self.bare: (255, 255, 255)}
+        self._show(self.plain)
+        colour = {self.plain: (255, 255, 255)}
         _, depth = self.renderer.render(self.scene, flags=self.gl.RenderFlags.SEG, seg_node_map=colour)
         return np.asarray(depth, dtype=np.float32)
 
     def albedo_and_normal(
         self, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"], size_hw: tuple[int, int]
     ) -> tuple[Float[np.ndarray, "H W 4"], Float[np.ndarray, "H W 4"]]:
-        """Skin, and normals n as (n + 1) / 2, times coverage, with coverage as the fourth channel; 0..255."""
+        """Albedo, and normals n as (n + 1) / 2, both times coverage; the fourth channel is coverage; 0..255."""
         self._aim(K, T_cam_obj, size_hw)
         flags = self.gl.RenderFlags.FLAT | self.gl.RenderFlags.RGBA | self.gl.RenderFlags.SKIP_CULL_FACES
         layers = []
-        for node in (self.skin, self.normals):
+        for node in (self.albedo, self.normals):
             self._show(node)
             layers.append(self.renderer.render(self.scene, flags=flags)[0].astype(np.float64))
         return layers[0], layers[1]
 
     def _show(self, only: Any) -> None:
-        for node in (self.skin, self.normals, self.bare):
+        for node in (self.albedo, self.normals, self.plain):
             node.mesh.is_visible = node is only
 
     def _aim(self, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"], size_hw: tuple[int, int]) -> None:
         self.renderer.viewport_height, self.renderer.viewport_width = size_hw
         camera = self.camera.camera
         camera.fx, camera.fy = K[0, 0], K[1, 1]
-        camera.cx, camera.cy = K[0, 2] + 0.5, K[1, 2] + 0.5  # in OpenGL pixel 0 spans 0 to 1
+        camera.cx, camera.cy = K[0, 2] + 0.5, K[1, 2] + 0.5  # OpenGL's pixel 0 spans 0 to 1
         T_cam_centred = T_cam_obj.copy()
         T_cam_centred[:3, 3] += T_cam_obj[:3, :3] @ self.centre
         middle = T_cam_centred[2, 3]
@@ -134,9 +134,9 @@ class _Canvas:
         self.scene.set_pose(self.camera, inverse(_GL_FROM_CV @ T_cam_centred))
 
 
-def _skin(gl: Any, mesh: Mesh, vertices: Float[np.ndarray, "v 3"]) -> Any:
+def _albedo_primitive(gl: Any, mesh: Mesh, vertices: Float[np.ndarray, "v 3"]) -> Any:
     if mesh.texture is not None and mesh.uv is not None:
-        # four channels: OpenGL wants rows of a multiple of four bytes
+        # four channels, because OpenGL needs rows of a multiple of four bytes
         opaque = np.dstack([mesh.texture, np.full(mesh.texture.shape[:2], 255, dtype=np.uint8)])
         material = _two_sided(gl, baseColorTexture=gl.Texture(source=opaque, source_channels="RGBA"))
         return gl.Primitive(vertices, indices=mesh.faces, texcoord_0=mesh.uv, material=material)
@@ -151,15 +151,15 @@ def _two_sided(gl: Any, **textures: Any) -> Any:
 
 
 @contextmanager
-def _canvas(mesh: Mesh, crease_deg: float) -> Iterator[_Canvas]:
-    """A canvas whose context is freed at the end. Raises BadInput where OpenGL cannot be had."""
+def _open_canvas(mesh: Mesh, crease_deg: float) -> Iterator[_Canvas]:
+    """A canvas whose OpenGL context is freed at the end. Raises BadInput where OpenGL is not available."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # it announces its missing accelerator to every log
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # else it logs that its accelerator is missing
     try:
         import pyrender as gl
 
         canvas = _Canvas(gl, mesh, crease_deg)
-    except Exception as error:  # PyOpenGL fails with whatever the missing library, driver or device made of it
+    except Exception as error:  # PyOpenGL raises many types for a missing library, driver or device
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         needed = "EGL (apt-get install libegl1 libgl1-mesa-dri), or render=raycast"
         raise BadInput("render=pyrender", found=f"no OpenGL context: {reason}", needed=needed) from None
