@@ -64,7 +64,7 @@ def text_width(*, small: bool, version: int) -> int:
 
 
 def write_folder(root: Path, *, small: bool = True, version: int = 1, dtype: str = "float32", seed: int = 0) -> Path:
-    """The folder, with full-precision file names whatever the dtype."""
+    """The folder, with full-precision file names for any dtype."""
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 
     torch_dtype = getattr(torch, dtype)

@@ -1,6 +1,6 @@
 """Writes a folder as transformers' save_pretrained does, with seeded random weights: for tests, nothing learned.
 
-Names of tensors and config are those of the hub's checkpoints, whatever the version of transformers that is installed.
+Names of tensors and config are those of the hub's checkpoints, for any installed version of transformers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""detect=cnos in the graph, on a scene whose objects are told apart by their colour."""
+"""detect=cnos in the graph, on a scene whose objects differ by colour."""
 
 import json
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ CALLS: list[str] = []
 
 @spec
 class TrueMasks(Proposer):
-    """Ground-truth masks, and squares of whatever lies in the corners; nothing of ``blind`` images."""
+    """Ground-truth masks, and squares in the corners of the image; no proposals in ``blind`` images."""
 
     kind: ClassVar[str] = "proposals.true_masks"
     root: str
@@ -71,7 +71,7 @@ class TrueMasks(Proposer):
 
 @spec
 class Hue(Extractor):
-    """A class token that is the colour of a crop less its grey: a perfect descriptor of this scene."""
+    """A class token that is the crop's mean colour minus its grey: a perfect descriptor in this scene."""
 
     kind: ClassVar[str] = "extract.hue"
     model: ClassVar[str] = "hue"
@@ -95,7 +95,7 @@ class Hue(Extractor):
 
 @pytest.fixture(scope="module")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A synthetic scene whose objects are all of one colour each, before a grey wall."""
+    """A synthetic scene of objects with one colour each in front of a grey wall."""
     root = tmp_path_factory.mktemp("painted") / "scene"
     write_dataset(root, objects=2, images=2, seed=5, size_hw=(240, 320), per_image=2, occluded=0.0, progress=False)
     for obj_id, colour in COLOURS.items():
@@ -164,7 +164,7 @@ def test_a_sweep_over_thresholds_proposes_and_describes_nothing(painted: Path, c
     assert CALLS == []
 
 
-def test_another_proposal_spec_describes_no_template_again(painted: Path, cache: Path):
+def test_another_proposer_reuses_the_templates_descriptors(painted: Path, cache: Path):
     graph_of(painted, cache).detect()
     graph = graph_of(painted, cache, proposals=TrueMasks(root=str(painted), blind=(7,)))
     graph.detect()
@@ -173,7 +173,7 @@ def test_another_proposal_spec_describes_no_template_again(painted: Path, cache:
     assert counts["proposals"] == counts["proposal features"] > 0
 
 
-def test_templates_of_the_route_are_those_that_are_described(painted: Path, cache: Path):
+def test_templates_of_the_route_are_reused_for_descriptors(painted: Path, cache: Path):
     graph = graph_of(painted, cache, describe=Hog(), describe_layer=Cosine().layer)
     described = graph.detections.proposals
     assert described is not None
@@ -186,7 +186,7 @@ def test_templates_of_the_route_are_those_that_are_described(painted: Path, cach
     )  # layer 2 for both, layer 8 for the route
 
 
-def test_detections_come_back_from_their_file(painted: Path, cache: Path, tmp_path: Path):
+def test_written_detections_are_read_back_equal(painted: Path, cache: Path, tmp_path: Path):
     graph = graph_of(painted, cache, keep="all")
     usable = [d for d in graph.detections.all if d.defect is None]
     write_detections(tmp_path / "detections.json", graph.detections.all)
@@ -197,7 +197,7 @@ def test_detections_come_back_from_their_file(painted: Path, cache: Path, tmp_pa
     assert isinstance(entry["segmentation"]["counts"], list)
 
 
-def test_an_image_without_a_proposal_answers_why(painted: Path, cache: Path):
+def test_an_image_without_proposals_says_why(painted: Path, cache: Path):
     graph = graph_of(painted, cache, proposals=TrueMasks(root=str(painted), blind=(0,)))
     answers = [a for a in graph.estimate() if a.im_id == 0]
     assert len(answers) == len([t for t in graph.context.targets if t.im_id == 0]) > 0
@@ -206,7 +206,7 @@ def test_an_image_without_a_proposal_answers_why(painted: Path, cache: Path):
         assert (answer.stage, answer.reason) == ("detect", "no mask was proposed in the image")
 
 
-def test_a_plan_ends_with_detections_that_are_not_there(painted: Path, tmp_path: Path):
+def test_a_plan_ends_at_missing_detections(painted: Path, tmp_path: Path):
     graph = graph_of(painted, tmp_path)
     nodes = list(graph.plan())
     assert CALLS == []
@@ -228,7 +228,7 @@ def test_keys_do_not_depend_on_measured_seconds(painted: Path, cache: Path, tmp_
     assert len(keys) == 1
 
 
-def test_an_interrupted_run_goes_on_with_the_images_that_are_left(painted: Path, tmp_path: Path):
+def test_an_interrupted_run_resumes_with_the_remaining_images(painted: Path, tmp_path: Path):
     graph = graph_of(painted, tmp_path)
     described = graph.detections.proposals
     assert described is not None
@@ -247,7 +247,7 @@ def test_an_interrupted_run_goes_on_with_the_images_that_are_left(painted: Path,
         ({"describe": Coordinates()}, r"detect\.describe: found extract\.coordinates, an oracle"),
     ],
 )
-def test_a_descriptor_that_cannot_be_is_told_before_any_work(painted: Path, cache: Path, changes: dict, part: str):
+def test_an_impossible_descriptor_is_refused_before_any_work(painted: Path, cache: Path, changes: dict, part: str):
     with pytest.raises(BadInput, match=part) as raised:
         graph_of(painted, cache, **changes).check()
     assert "\n" not in str(raised.value)
@@ -264,7 +264,7 @@ def sam(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def photo(capsys, monkeypatch, tmp_path, painted, cache, sam):
-    """The command line on a photograph with neither mask nor box; ``detect=cnos`` unless told otherwise."""
+    """The command line on a photograph with neither mask nor box; ``detect=cnos`` by default."""
     monkeypatch.chdir(tmp_path)
     found = (
         "detect=cnos", "extract@detect.describe=hog", "detect.describe_layer=8", f"detect.proposals.weights={sam}",
@@ -306,7 +306,7 @@ def test_several_meshes_are_found_in_one_photograph(photo, painted, tmp_path: Pa
     assert {answer["obj_id"] for answer in answers} == {1, 2}
 
 
-def test_the_file_of_detections_leads_to_the_same_pose(photo, tmp_path: Path):
+def test_the_detections_file_gives_the_same_pose(photo, tmp_path: Path):
     assert photo("step=estimate").status == 0
     (path,) = tmp_path.glob("results/*/*/detections.json")
     ran = photo("step=estimate", "detect=json", f"detect.path={path}", "out=again")
@@ -317,7 +317,7 @@ def test_the_file_of_detections_leads_to_the_same_pose(photo, tmp_path: Path):
     assert ours == theirs
 
 
-def test_a_photograph_in_which_nothing_is_found_says_why(photo):
+def test_a_photograph_without_detections_says_why(photo):
     ran = photo("step=detect", "detect.proposals.min_stability=1")
     assert ran.status == 0
     assert "0 detections" in ran.out
@@ -353,14 +353,14 @@ def test_bad_input_is_one_line(photo, arguments: tuple[str, ...], part: str):
     assert len(ran.err.strip().splitlines()) == 1
 
 
-def test_a_photograph_without_mask_or_box_is_told_of_cnos(photo):
+def test_a_photograph_without_mask_or_box_suggests_cnos(photo):
     ran = photo("detect=photo")
     assert ran.status == 1
     assert "neither of mask and bbox" in ran.err
     assert "detect=cnos" in ran.err
 
 
-def test_a_mask_beside_a_detector_that_finds_objects_itself_is_refused(photo):
+def test_a_mask_with_a_detector_that_finds_objects_is_refused(photo):
     ran = photo("dataset.bbox=[10,10,40,40]")
     assert ran.status == 1
     assert "dataset.bbox: found with detect.cnos, needs detect=photo, or no mask and no box" in ran.err

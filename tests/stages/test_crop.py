@@ -57,7 +57,7 @@ def test_background_never_reaches_the_crop(variant):
 
 
 @pytest.mark.parametrize("variant", [Square, Virtual])
-def test_box_counts_only_without_a_mask(variant):
+def test_box_is_used_only_without_a_mask(variant):
     rgb, mask = _scene()
     with_mask = variant()(rgb, mask, (0.0, 0.0, 5.0, 5.0), K)
     crop = variant()(rgb, None, (29.5, 19.5, 69.5, 69.5), K)
@@ -66,7 +66,7 @@ def test_box_counts_only_without_a_mask(variant):
     assert crop.rgb[crop.mask].min() > 0
 
 
-def test_object_at_the_border_stays_where_it_is():
+def test_crop_of_an_object_at_the_border_is_not_moved():
     rgb = np.full((40, 40, 3), 200, np.uint8)
     mask = np.zeros((40, 40), bool)
     mask[:10, :10] = True
@@ -77,7 +77,7 @@ def test_object_at_the_border_stays_where_it_is():
     assert crop.mask[10:30, 10:30].all()
 
 
-def test_what_the_virtual_camera_shows_is_where_its_projection_says():
+def test_virtual_crop_agrees_with_the_virtual_cameras_projection():
     """Small spheres in space, drawn as dots in a photograph, lie in the crop where the virtual camera projects them."""
     far = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
     points = np.array([[260.0, 150.0, 600.0], [290.0, 160.0, 640.0], [275.0, 190.0, 700.0], [240.0, 195.0, 620.0]])
@@ -96,7 +96,7 @@ def test_what_the_virtual_camera_shows_is_where_its_projection_says():
         assert error < 0.1  # image px; a dot's centre of mass is not quite the image of its centre
 
 
-def test_virtual_crop_at_the_border_stays_where_it_is():
+def test_virtual_crop_at_the_border_is_not_moved():
     rgb, mask = np.full((40, 40, 3), 200, np.uint8), np.zeros((40, 40), bool)
     mask[:10, :10] = True
     straight = np.array([[60.0, 0.0, 4.5], [0.0, 60.0, 4.5], [0.0, 0.0, 1.0]])  # looks at the mask's centre
@@ -107,7 +107,7 @@ def test_virtual_crop_at_the_border_stays_where_it_is():
     assert not crop.mask[:10].any()
 
 
-def test_a_turned_virtual_camera_sees_the_object_in_the_middle():
+def test_a_turned_virtual_camera_centres_the_object():
     rgb, mask = _scene()
     crop = Virtual(size=60)(rgb, mask, WHOLE, K)
     assert crop.A_crop_img[2, 0] != 0  # K is wide: the mask's centre is 14 degrees off the axis
@@ -128,12 +128,12 @@ def test_a_turned_virtual_camera_sees_the_object_in_the_middle():
         (None, (200.0, 10.0, 210.0, 30.0), "box (200, 10, 210, 30) holds no pixel of the 120 x 90 image"),
     ],
 )
-def test_nothing_to_crop_says_why(variant, mask, bbox, reason):
+def test_an_object_that_cannot_be_cropped_says_why(variant, mask, bbox, reason):
     with pytest.raises(NoPose, match="crop: ") as failure:
         variant()(_scene()[0], mask, bbox, K)
     assert failure.value.reason == reason
 
 
-def test_padding_that_cuts_the_object_is_refused():
+def test_padding_below_one_is_refused():
     with pytest.raises(BadInput, match=r"crop.padding_ratio: found 0.9, needs greater than or equal to 1"):
         build(Square, {"padding_ratio": 0.9}, where="crop")

@@ -58,18 +58,18 @@ def detected(tiny: Dataset, tmp_path: Path) -> Callable[..., list[Detection]]:
 
 
 @pytest.mark.parametrize("variant", [GtMask(), GtMask(visible=False), GtBbox(), GtBbox(bbox="obj")])
-def test_answer_to_a_target_does_not_depend_on_the_others(tiny: Dataset, variant: GtMask | GtBbox):
+def test_detections_of_a_target_do_not_depend_on_other_targets(tiny: Dataset, variant: GtMask | GtBbox):
     together = variant(tiny, tiny.targets)
     assert together == [d for target in tiny.targets for d in variant(tiny, [target])]
     assert len(together) == sum(t.inst_count for t in tiny.targets)
 
 
-def test_order_of_a_detections_file_changes_nothing(detected: Callable[..., list[Detection]]):
+def test_order_of_a_detections_file_does_not_matter(detected: Callable[..., list[Detection]]):
     entries = [entry(score=s) for s in (0.2, 0.9, 0.4)]
     assert detected(*entries, keep="all") == detected(*entries[::-1], keep="all")
 
 
-def test_ways_to_write_a_detection_read_the_same(tiny: Dataset, tmp_path: Path):
+def test_equivalent_notations_of_a_detection_are_read_equally(tiny: Dataset, tmp_path: Path):
     compressed = {"size": list(SIZE_HW), "counts": None}
     write_json(tmp_path / "list.json", [entry()])
     (plain,) = Json(path=str(tmp_path / "list.json"))(tiny, tiny.targets)
@@ -85,7 +85,7 @@ def test_ways_to_write_a_detection_read_the_same(tiny: Dataset, tmp_path: Path):
     assert (plain.score, plain.time_s, plain.gt_id, plain.defect) == (0.5, 0.2, None, None)
 
 
-def test_key_follows_the_bytes_of_the_file_not_its_place(tmp_path: Path):
+def test_key_depends_on_the_bytes_of_the_file_not_its_path(tmp_path: Path):
     (tmp_path / "a").mkdir()
     for path in (tmp_path / "a" / "x.json", tmp_path / "y.json"):
         write_json(path, [entry()])
@@ -120,7 +120,7 @@ def test_best_scored_detections_of_a_target_are_kept(detected, keep: object, sco
     assert [d.score for d in detected(*(entry(score=s) for s in (0.2, 0.9, 0.4)), keep=keep)] == scores
 
 
-def test_detections_nobody_asked_for_are_not_looked_at(detected: Callable[..., list[Detection]]):
+def test_detections_without_a_target_are_ignored(detected: Callable[..., list[Detection]]):
     others = [entry(image_id=999), entry(category_id=77), entry(scene_id=1, segmentation="broken")]
     assert detected(*others) == []
 
@@ -154,7 +154,7 @@ def test_mask_without_a_box_gets_the_box_of_its_pixels(detected: Callable[..., l
         ({"segmentation": [[1, 2, 3, 4, 5, 6]]}, "not an RLE"),
     ],
 )
-def test_one_bad_detection_is_recorded_and_the_others_go_on(detected, changes: dict[str, Any], part: str):
+def test_one_bad_detection_is_recorded_and_the_others_are_kept(detected, changes: dict[str, Any], part: str):
     bad, good = detected(entry(**changes), keep=2), detected(entry(**changes), entry(score=0.1), keep=2)
     assert len(bad) == 1
     assert part in bad[0].defect
@@ -163,7 +163,7 @@ def test_one_bad_detection_is_recorded_and_the_others_go_on(detected, changes: d
 
 
 @pytest.mark.parametrize(
-    ("spoil", "part"),
+    ("damage", "part"),
     [
         (lambda path: path.unlink(), "no such file"),
         (lambda path: path.write_bytes(path.read_bytes()[:60]), "broken image"),
@@ -171,9 +171,9 @@ def test_one_bad_detection_is_recorded_and_the_others_go_on(detected, changes: d
         (lambda path: Image.new("L", (32, 24), 255).save(path), "mask of [24, 32] where the image is [48, 64]"),
     ],
 )
-def test_bad_ground_truth_mask_is_recorded_and_the_others_go_on(tiny: Dataset, spoil, part: str):
+def test_bad_ground_truth_mask_is_recorded_and_the_others_are_kept(tiny: Dataset, damage, part: str):
     whole = GtMask()(tiny, tiny.targets)
-    spoil(tiny.mask_path(7, 0, 2))
+    damage(tiny.mask_path(7, 0, 2))
     now = GtMask()(tiny, tiny.targets)
     assert [d.defect is None for d in now] == [True, True, False, True]
     assert part in now[2].defect
@@ -182,7 +182,7 @@ def test_bad_ground_truth_mask_is_recorded_and_the_others_go_on(tiny: Dataset, s
     assert [d for d in now if not d.defect] == [d for d in whole if d.gt_id != 2]
 
 
-def test_instance_out_of_sight_has_no_box(tmp_path: Path):
+def test_invisible_instance_has_no_box(tmp_path: Path):
     root = write_tiny_bop(tmp_path / "tiny")
     path = root / "test" / "000007" / "scene_gt_info.json"
     edit_json(path, lambda info: info["3"][0].update(bbox_visib=[-1, -1, -1, -1]))
@@ -194,7 +194,7 @@ def test_instance_out_of_sight_has_no_box(tmp_path: Path):
     assert (d.defect, d.bbox_xyxy) == (None, (x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
 
 
-def test_sources_are_the_files_the_answer_depends_on(tiny: Dataset, tmp_path: Path):
+def test_sources_are_the_files_that_detections_depend_on(tiny: Dataset, tmp_path: Path):
     scene = tiny.root / "test" / "000007"
     annotations = [scene / "scene_gt.json", scene / "scene_gt_info.json"]
     target = [Target(7, 0, 2)]
@@ -218,9 +218,7 @@ def test_sources_are_the_files_the_answer_depends_on(tiny: Dataset, tmp_path: Pa
         ('[{"scene_id": 7, "image_id": 3, "category_id": 2, "score": 1}]', ["detection 0", "bbox"]),
     ],
 )
-def test_file_that_holds_no_detections_is_one_line(
-    tiny: Dataset, tmp_path: Path, content: str | None, parts: list[str]
-):
+def test_file_in_another_format_is_one_line(tiny: Dataset, tmp_path: Path, content: str | None, parts: list[str]):
     path = tmp_path / "d.json"
     if content is not None:
         path.write_text(content)
@@ -261,7 +259,7 @@ def test_yaml_lists_every_field_with_its_default(name: str, cls: type):
     assert cls.kind == f"detect.{name}"
 
 
-def test_sam_detections_of_lmo_read_whole(bop_mini: Path):
+def test_sam_detections_of_lmo_are_all_read(bop_mini: Path):
     dataset = open_dataset(bop_mini / "lmo", name="lmo")
     path = bop_mini / "lmo" / "detections" / "sam_lmo-test.json"
     detections = Json(path=str(path))(dataset, dataset.targets)
@@ -271,7 +269,7 @@ def test_sam_detections_of_lmo_read_whole(bop_mini: Path):
         assert d.bbox_xyxy == mask_bbox(decode_rle(d.rle))
 
 
-def test_visible_masks_of_lmo_answer_all_targets(bop_mini: Path):
+def test_visible_masks_of_lmo_give_a_detection_for_every_target(bop_mini: Path):
     dataset = open_dataset(bop_mini / "lmo", name="lmo")
     detections = GtMask()(dataset, dataset.targets)
     assert [(d.scene_id, d.im_id, d.obj_id) for d in detections] == [

@@ -1,4 +1,4 @@
-"""What is made of descriptors: assignment, thresholds, suppression, reasons."""
+"""detect=cnos on given descriptors: assignment, thresholds, suppression, reasons."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,7 +39,7 @@ def proposal(x: int, y: int = 0, side: int = 10) -> Proposal:
 
 
 def like(**cosines: float) -> torch.Tensor:
-    """A descriptor of length 1 with the given cosines with objects 3, 5 and 9; the rest goes beside them all."""
+    """A unit descriptor with the given cosines with objects 3, 5 and 9; the rest is orthogonal to all of them."""
     first = [cosines.get(f"o{obj_id}", 0.0) for obj_id in TEMPLATES]
     return torch.tensor([*first, (1 - sum(c * c for c in first)) ** 0.5])
 
@@ -52,7 +52,7 @@ def found(
     return cnos(**fields)(DATASET, TARGETS, Descriptors(templates, lambda image_id: image))
 
 
-def test_each_proposal_goes_to_the_object_it_looks_most_like():
+def test_each_proposal_is_assigned_to_the_most_similar_object():
     parts = [(proposal(0), like(o3=0.6, o5=0.3)), (proposal(20), like(o3=0.2, o5=0.9))]
     three, five = found(parts)
     assert (three.obj_id, three.bbox_xyxy, three.rle) == (3, parts[0][0].bbox_xyxy, parts[0][0].rle)
@@ -68,12 +68,12 @@ def test_score_is_the_mean_of_the_five_best_templates():
     assert found([(proposal(0), AXES[0])], {**TEMPLATES, 3: views}, best=1)[0].score == pytest.approx(0.9, abs=1e-6)
 
 
-def test_order_of_proposals_changes_nothing_but_ties():
+def test_order_of_proposals_matters_only_for_ties():
     parts = [(proposal(25 * i), like(o3=0.9 - 0.1 * i, o5=0.1 + 0.1 * i)) for i in range(8)]
     assert found(parts, keep="all") == found(parts[::-1], keep="all")
 
 
-def test_best_first_and_as_many_as_the_target_asks_for():
+def test_a_target_gets_its_inst_count_best_first():
     parts = [(proposal(25 * i), like(o3=c)) for i, c in enumerate((0.3, 0.9, 0.5))]
     scores = [d.score for d in found(parts) if d.obj_id == 3]
     assert scores == pytest.approx([0.9, 0.5], abs=1e-6)
@@ -81,14 +81,14 @@ def test_best_first_and_as_many_as_the_target_asks_for():
     assert len([d for d in found(parts, keep="all") if d.obj_id == 3]) == 3
 
 
-def test_overlapping_detections_of_one_object_go_and_of_two_objects_stay():
+def test_overlapping_detections_are_suppressed_within_one_object_only():
     parts = [(proposal(0), like(o3=0.9)), (proposal(3), like(o3=0.8)), (proposal(2), like(o5=0.7))]
     kept = found(parts, keep="all")
     assert [(d.obj_id, d.bbox_xyxy) for d in kept] == [(3, parts[0][0].bbox_xyxy), (5, parts[2][0].bbox_xyxy)]
     assert len(found(parts, keep="all", nms_iou=0.6)) == 3  # 7 of 13 columns are shared
 
 
-def test_an_image_keeps_no_more_than_it_may():
+def test_an_image_keeps_at_most_max_per_image():
     parts = [(proposal(25 * i), like(o3=0.9 - 0.1 * i)) for i in range(4)] + [(proposal(120), like(o5=0.3))]
     kept = found(parts, keep="all", max_per_image=3)
     assert [d.obj_id for d in kept if d.defect is None] == [3, 3, 3]

@@ -1,4 +1,4 @@
-"""The model that ships: from the package, without a network, with its own head."""
+"""The model that ships with the package: its features, edges, keys and trained head."""
 
 import json
 import time
@@ -39,7 +39,7 @@ def test_features_come_from_the_package(weights):
     assert "not Stable Diffusion's" in extract.notice
 
 
-def test_edges_are_the_same_in_any_batch_and_stay_while_the_weights_change():
+def test_edges_do_not_depend_on_the_batch_or_the_weights():
     many = crops(5)
     whole = Embedded().load(Runtime(device="cpu", batch=2))(many, [EDGES])[EDGES]
     assert whole.shape == (5, 8, 64, 64)
@@ -56,7 +56,7 @@ def test_edges_count_in_the_footprint():
     assert with_edges.weight_bytes == without.weight_bytes
 
 
-def test_the_two_sets_of_weights_have_keys_of_their_own():
+def test_the_two_sets_of_weights_have_different_keys():
     keys = {json.dumps(Embedded(weights=name).recipe()) for name in ("learned", "pure")}
     assert len(keys) == 2
 
@@ -79,7 +79,7 @@ def test_missing_weights_say_how_to_make_them(tmp_path, monkeypatch):
         Embedded().feature_shape(2)
 
 
-def test_the_head_fuses_both_sides_alike_at_twice_the_finest_layers_cells():
+def test_the_head_encodes_both_images_equally_at_twice_the_finest_layers_cells():
     maps = Embedded().load(Runtime(device="cpu"))(crops(1), ALL)
     one = CropFeatures({layer: m[0] for layer, m in maps.items()}, torch.ones(128, 128, dtype=torch.bool))
     for fuse in (Learned(), Learned(layers=LAYERS)):
@@ -88,7 +88,7 @@ def test_the_head_fuses_both_sides_alike_at_twice_the_finest_layers_cells():
         assert pair.query.shape[-1] == 2 * one.maps[11].shape[-1]
 
 
-def test_descriptors_and_edges_share_a_cosine_by_the_square_of_their_weight():
+def test_edges_contribute_to_the_cosine_by_the_square_of_their_weight():
     maps = Embedded().load(Runtime(device="cpu"))(crops(2), ALL)
     mask = torch.ones(128, 128, dtype=torch.bool)
     query, template = (CropFeatures({layer: m[k] for layer, m in maps.items()}, mask) for k in (0, 1))
@@ -102,7 +102,7 @@ def test_descriptors_and_edges_share_a_cosine_by_the_square_of_their_weight():
     torch.testing.assert_close(inner(Learned(edges=2.0)) - cosine, 4 * (inner(Learned(edges=1.0)) - cosine))
 
 
-def test_the_weight_of_edges_is_part_of_the_key_where_there_are_any():
+def test_the_weight_of_edges_enters_the_key_only_where_edges_are_used():
     assert Learned(edges=2.0).recipe() != Learned().recipe()
     assert Learned(layers=LAYERS, edges=2.0).recipe() == Learned(layers=LAYERS).recipe()
 
@@ -115,7 +115,7 @@ def test_the_head_refuses_features_it_was_not_trained_on():
         Learned(layers=(2, 5)).check(Embedded().model)
 
 
-def test_auto_takes_the_head_where_the_features_have_one():
+def test_auto_uses_the_head_trained_for_the_features():
     assert Auto().resolve_for(Embedded().model) == Learned()
     with pytest.raises(BadInput, match=r"fuse.layers: found \[5, 8\]"):
         Auto(layers=(5, 8)).resolve_for(Embedded().model).check(Embedded().model)

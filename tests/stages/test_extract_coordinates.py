@@ -1,4 +1,4 @@
-"""The oracle's features are functions of the object point, seen from anywhere."""
+"""The oracle's features depend on the object point and not on the view."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_foreground_has_unit_length_and_background_is_zero() -> None:
         assert 0 < seen.sum() < len(seen)
 
 
-def test_occluders_and_the_world_outside_the_image_are_background() -> None:
+def test_occluders_and_points_outside_the_image_are_background() -> None:
     crops = plane_view(pose(0))
     crops.mask[0, :64] = False  # hidden by something nearer, whose depth the map may hold
     _, seen = cell_points(crops, 0, cells=64)
@@ -100,7 +100,7 @@ def test_occluders_and_the_world_outside_the_image_are_background() -> None:
     assert not cell_points(shifted, 0, cells=64)[1].any()
 
 
-def test_the_seed_decides_and_nothing_else() -> None:
+def test_features_depend_on_the_seed_alone() -> None:
     crops = plane_view(pose(10))
     first, again, other = (Coordinates(seed=s).load(CPU)(crops, [2])[2] for s in (0, 0, 1))
     assert torch.equal(first, again)

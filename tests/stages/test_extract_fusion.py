@@ -1,4 +1,4 @@
-"""Two extractors side by side, from specs and from the command line."""
+"""Two extractors concatenated, from specs and from the command line."""
 
 import json
 from pathlib import Path
@@ -61,7 +61,7 @@ def test_the_second_is_resampled_to_the_cells_of_the_first() -> None:
         torch.testing.assert_close(maps[:, 72:], 0.5 * torch.nn.functional.normalize(second, dim=1))
 
 
-def test_cosines_of_the_whole_are_the_weighted_mean_of_both() -> None:
+def test_the_cosine_of_fused_cells_is_the_weighted_mean_of_both_cosines() -> None:
     crops = some_crops(2)
     hog, pixels = (torch.nn.functional.normalize(spec.load(CPU)(crops, [2])[2], dim=1) for spec in (Hog(), Pixels()))
     joined = fusion(Hog(), Pixels(), [[2, 2]], alpha=0.75).load(CPU)(crops, [2])[2]
@@ -91,14 +91,14 @@ def test_any_two_extractors_and_a_fusion_of_fusions(tmp_path: Path) -> None:
         assert maps.dtype == torch.float32
 
 
-def test_the_same_features_whatever_the_batch() -> None:
+def test_features_do_not_depend_on_the_batch() -> None:
     backbone, crops = fusion(RandomSD(), Hog(), [[2, 5]]).load(CPU), some_crops(3)
     together = backbone(crops, [2])[2]
     for i in range(3):
         torch.testing.assert_close(backbone(crops[[i]], [2])[2][0], together[i], rtol=1e-5, atol=1e-5)
 
 
-def test_recipes_nest_and_names_join() -> None:
+def test_recipe_holds_both_recipes_and_model_joins_both_names() -> None:
     spec = fusion(RandomSD(), Hog(signed=False), [[11, 5], [2, 2]])
     recipe = spec.recipe()
     assert (recipe["first"], recipe["second"]) == (RandomSD().recipe(), Hog(signed=False).recipe())
@@ -116,7 +116,7 @@ class NoExtractor(Spec):
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "message"),
     [
         ({"first": "hog"}, "extract.first: found 'hog', needs an extract variant, chosen as extract@extract.first=hog"),
         ({"second": NoExtractor()}, "extract.second: found "),
@@ -126,20 +126,20 @@ class NoExtractor(Spec):
         ({"alpha": 1.5}, "extract.alpha: found 1.5"),
     ],
 )
-def test_a_wrong_field_is_told(fields: dict, told: str) -> None:
+def test_a_wrong_field_is_named(fields: dict, message: str) -> None:
     with pytest.raises(BadInput) as caught:
         build(Fusion, {"first": Hog(), "second": Pixels(), "layers": [[2, 2]]} | fields, where="extract")
-    assert str(caught.value).startswith(told)
+    assert str(caught.value).startswith(message)
 
 
-def test_a_fault_of_one_of_the_two_names_it() -> None:
+def test_an_error_in_a_member_names_the_member() -> None:
     spec = fusion(Hog(), Pixels(), [[2, 2], [5, 3], [7, 2]])
     with pytest.raises(BadInput, match=r"extract layer: found 11, needs one of 2, 5, 7, as extract\.layers pairs them"):
         spec.feature_shape(11)
     with pytest.raises(BadInput, match=r"extract\.first layer: found 7, needs one of 2, 5, 8, 11"):
         spec.load(CPU)(some_crops(1), [7])
-    told = r"extract\.layers: found layer 3 of the second extractor beside layer 5, needs one of 2, 5, 8, 11"
-    with pytest.raises(BadInput, match=told):
+    message = r"extract\.layers: found layer 3 of the second extractor, paired with layer 5, needs one of 2, 5, 8, 11"
+    with pytest.raises(BadInput, match=message):
         spec.feature_shape(5)
     with pytest.raises(BadInput, match=r"extract\.second\.weights: found './nowhere'"):
         fusion(Hog(), Dino(weights="./nowhere"), [[2, 2]]).recipe()
@@ -179,7 +179,7 @@ ANY_TWO = ("extract=fusion", "extract@extract.first=hog", "extract@extract.secon
 LAYERS = "extract.layers=[[2,2],[5,5],[8,8],[11,8]]"
 
 
-def test_the_command_line_joins_any_two(dzop, tmp_path) -> None:
+def test_the_command_line_fuses_any_two(dzop, tmp_path) -> None:
     ran = dzop(*ANY_TWO, LAYERS)
     assert ran.status == 0, ran.err
     assert "features fusion-hog-pixels" in ran.out
@@ -190,7 +190,7 @@ def test_the_command_line_joins_any_two(dzop, tmp_path) -> None:
     assert {computed for computed, _ in again.values()} == {0}
 
 
-def test_the_command_line_joins_a_learned_model_and_a_transformer(dzop, tmp_path) -> None:
+def test_the_command_line_fuses_a_learned_model_and_a_transformer(dzop, tmp_path) -> None:
     folder = write_vit(tmp_path / "vit", depth=3)
     ran = dzop(
         "step=onboard", "extract=fusion", "extract@extract.first=embedded", "extract@extract.second=dino",
@@ -201,7 +201,7 @@ def test_the_command_line_joins_a_learned_model_and_a_transformer(dzop, tmp_path
     assert ran.counts()[0]["template features"] == (6, 0)
 
 
-def test_a_transformer_alone_goes_through_the_command_line(dzop, tmp_path) -> None:
+def test_the_command_line_runs_a_single_transformer(dzop, tmp_path) -> None:
     folder = write_vit(tmp_path / "vit", depth=3)
     ran = dzop(
         "extract=dino", f"extract.weights={folder}", "extract.stride=4", "extract.input_size=64", "extract.binned=[1]",
@@ -211,7 +211,7 @@ def test_a_transformer_alone_goes_through_the_command_line(dzop, tmp_path) -> No
     assert "features dino-" in ran.out
 
 
-def test_a_sweep_may_go_over_one_of_the_two(dzop) -> None:
+def test_a_sweep_can_vary_one_member(dzop) -> None:
     ran = dzop("-m", "step=onboard", *ANY_TWO[:2], "extract@extract.second=pixels,hog", LAYERS)
     assert ran.status == 0, ran.err
     assert "fusion-hog-pixels" in ran.out
@@ -219,21 +219,21 @@ def test_a_sweep_may_go_over_one_of_the_two(dzop) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         ((LAYERS, "extract.second.side=0"), "extract.second.side: found 0"),
         ((LAYERS, "extract.second._target_=nothing.Here"), "extract.second._target_"),
         (
             ("extract.layers=[[2,2],[5,3],[8,8],[11,8]]",),
-            "fuse.layers: found layer 3 of the second extractor beside layer 5",
+            "fuse.layers: found layer 3 of the second extractor, paired with layer 5",
         ),
         (("extract.layers=[[2,2]]",), "fuse.layers: found 5, needs one of 2, as extract.layers pairs them"),
         ((LAYERS, "extract.third=1"), "extract.third"),
     ],
 )
-def test_a_mistake_is_told_in_one_line(dzop, arguments, told) -> None:
+def test_an_error_is_one_line(dzop, arguments, message) -> None:
     ran = dzop(*ANY_TWO, *arguments)
     assert ran.status == 1
     lines = [line for line in ran.err.splitlines() if line]
     assert len(lines) == 1
-    assert told in lines[0]
+    assert message in lines[0]

@@ -1,4 +1,4 @@
-"""Gradient histograms: what they do not see, what they do, and where."""
+"""Gradient histograms: their invariances, their bins and their positions."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_neither_the_batch_nor_other_layers_change_a_byte() -> None:
         assert torch.equal(alone, together[k][2])
 
 
-def test_brightness_added_changes_nothing_and_contrast_little() -> None:
+def test_added_brightness_changes_nothing_and_contrast_little() -> None:
     rgb = noise() // 4 + 20
     backbone = Hog().load(CPU)
     plain, brighter, steeper = (backbone(crops_of(x), LAYERS) for x in (rgb, rgb + 60, rgb * 2))
@@ -75,7 +75,7 @@ def test_a_grating_falls_into_the_bins_of_its_direction(angle_deg: float) -> Non
     assert inner.max() > 0.95
 
 
-def test_sign_of_an_edge_counts_only_when_asked() -> None:
+def test_the_sign_of_an_edge_counts_only_if_signed() -> None:
     edge = np.full((1, 128, 128, 3), 50, np.uint8)
     edge[:, :, 64:] = 200
     for signed in (False, True):
@@ -84,7 +84,7 @@ def test_sign_of_an_edge_counts_only_when_asked() -> None:
         assert same is not signed
 
 
-def test_an_edge_answers_at_its_own_cells() -> None:
+def test_an_edge_changes_only_its_own_cells() -> None:
     edge = np.full((1, 128, 128, 3), 50, np.uint8)
     edge[:, 80:] = 200  # between rows 79 and 80
     for layer, cells in ((2, 8), (5, 16), (8, 32), (11, 64)):
@@ -97,7 +97,7 @@ def test_an_edge_answers_at_its_own_cells() -> None:
         assert rows[far].max() == 0
 
 
-def test_silhouette_can_be_left_out() -> None:
+def test_silhouette_zero_ignores_the_masks_border() -> None:
     mask = np.zeros((1, 128, 128), bool)
     mask[:, 30:90, 40:100] = True
     flat = np.full((1, 128, 128, 3), 180, np.uint8)
@@ -106,7 +106,7 @@ def test_silhouette_can_be_left_out() -> None:
     assert left_out.abs().max() == 0
 
 
-def test_energy_is_shared_out_completely() -> None:
+def test_bins_of_a_cell_sum_to_its_energy() -> None:
     rgb, mask = torch.from_numpy(noise(1)), torch.ones(1, 128, 128, dtype=torch.bool)
     sums = [
         oriented_energy(rgb, mask, orientations=n, signed=s, silhouette=1.0).sum(1)

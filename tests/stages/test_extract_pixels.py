@@ -21,7 +21,7 @@ def test_a_cell_holds_its_own_colours():
     assert maps[11][0, :, 5, 10].tolist() == [-1.0] * 12
 
 
-def test_shapes_are_those_promised():
+def test_maps_have_the_shapes_of_feature_shape():
     for side in (1, 2, 3):
         maps = Pixels(side=side).load(Runtime(device="cpu"))(crops(np.zeros((2, 96, 96, 3), np.uint8)), (5,))
         assert maps[5].shape[1:] == Pixels(side=side).feature_shape(5)

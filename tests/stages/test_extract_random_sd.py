@@ -1,4 +1,4 @@
-"""The control with random weights: the same on every machine, Stable Diffusion's in everything but its widths."""
+"""The control with random weights: equal on every machine; Stable Diffusion's architecture with other widths."""
 
 import hashlib
 
@@ -22,7 +22,7 @@ def some_crops(n: int = 2) -> Crops:
     return Crops(rgb, np.ones((n, 128, 128), bool), np.tile(np.eye(3), (n, 1, 1)))
 
 
-def test_weights_come_from_names_and_seed_alone() -> None:
+def test_weights_depend_on_names_and_seed_alone() -> None:
     torch.manual_seed(1)
     first = RandomSD().load_model()
     torch.manual_seed(2)
@@ -35,7 +35,7 @@ def test_weights_come_from_names_and_seed_alone() -> None:
     torch.testing.assert_close(first.unet.state_dict()["conv_in.weight"], expected)
 
 
-def test_loading_leaves_the_global_random_state_alone() -> None:
+def test_loading_does_not_change_the_global_random_state() -> None:
     torch.manual_seed(0)
     before = torch.get_rng_state()
     RandomSD().load(CPU)(some_crops(1), [2])
@@ -49,7 +49,7 @@ def test_model_names_widths_and_weights_seed_and_nothing_else() -> None:
     assert all(name.startswith("random_sd-") for name in names)
 
 
-def test_its_decoder_has_twelve_blocks_of_the_sizes_it_says() -> None:
+def test_its_decoder_has_twelve_blocks_of_the_sizes_of_feature_shape() -> None:
     crops = some_crops(1)
     for hook in ("pre", "post", "resnet"):
         spec = RandomSD(hook=hook)
@@ -60,7 +60,7 @@ def test_its_decoder_has_twelve_blocks_of_the_sizes_it_says() -> None:
         RandomSD().feature_shape(12)
 
 
-def test_features_tell_images_apart() -> None:
+def test_features_of_different_images_differ() -> None:
     maps = RandomSD(noise="none").load(CPU)(some_crops(2), LAYERS)
     for k in LAYERS:
         cosine = torch.nn.functional.cosine_similarity(maps[k][0].flatten(), maps[k][1].flatten(), dim=0)
@@ -96,7 +96,7 @@ def test_noise_follows_seed_and_content() -> None:
         assert not torch.equal(noise(mode, seed=1), noise(mode))
 
 
-def test_resizing_keeps_edges_on_edges() -> None:
+def test_resizing_aligns_image_edges() -> None:
     ramp = torch.arange(0, 128, 2, dtype=torch.uint8).view(1, 1, 64, 1).expand(1, 64, 64, 3)
     image = to_network_image(ramp, size=256)
     # pixel x of 256 lies at (x + .5) / 4 - .5 of 64; value 2 x there, away from the border

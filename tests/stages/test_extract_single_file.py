@@ -153,7 +153,7 @@ def test_shapes_alone_give_the_configuration(both: tuple[Path, Path]) -> None:
     np.testing.assert_array_equal(ours.alphas_cumprod, theirs.alphas_cumprod)
 
 
-def test_its_key_follows_its_bytes_and_not_its_place(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_its_key_depends_on_its_bytes_and_not_its_path(both: tuple[Path, Path], tmp_path: Path) -> None:
     _, file = both
     moved = tmp_path / "renamed.safetensors"
     moved.write_bytes(file.read_bytes())
@@ -165,7 +165,7 @@ def test_a_prompt_needs_a_tokenizer_which_one_file_does_not_hold(both: tuple[Pat
         extractor(both[1], prompt="a red duck").load(CPU)
 
 
-def test_what_is_missing_or_of_another_model_is_named(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_missing_tensors_and_other_models_are_named(both: tuple[Path, Path], tmp_path: Path) -> None:
     tensors = load_file(both[1])
 
     def refusal(changed: dict[str, torch.Tensor]) -> str:
@@ -191,7 +191,7 @@ def test_what_is_missing_or_of_another_model_is_named(both: tuple[Path, Path], t
     assert "no tensor" in refusal({"conv_in.weight": torch.zeros(1)})
 
 
-def test_a_file_cut_off_is_named(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_truncated_file_is_named(both: tuple[Path, Path], tmp_path: Path) -> None:
     path = tmp_path / "cut.safetensors"
     path.write_bytes(both[1].read_bytes()[:-1000])
     with pytest.raises(BadInput, match=r"cut\.safetensors.*a complete safetensors file"):

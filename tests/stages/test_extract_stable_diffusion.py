@@ -67,7 +67,7 @@ def assert_close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-5) -> No
 
 
 def plain_forward(folder: Path, crops: Crops, *, timestep: int, noise: torch.Tensor) -> dict[str, list[torch.Tensor]]:
-    """Maps of all 12 blocks by all hooks, read from the inputs and outputs of resnets in one whole forward."""
+    """Maps of all 12 blocks for all hooks, read from the inputs and outputs of resnets in one full forward pass."""
     unet = UNet2DConditionModel.from_pretrained(folder / "unet").eval()
     vae = AutoencoderKL.from_pretrained(folder / "vae").eval()
     encoder = CLIPTextModel.from_pretrained(folder / "text_encoder").eval()
@@ -164,13 +164,13 @@ def test_nothing_is_computed_past_the_deepest_block(sd1: Path) -> None:
     assert backbone.model.vae.decoder is None
 
 
-def test_a_hook_leaves_nothing_behind_in_the_model(sd1: Path) -> None:
+def test_hooks_are_removed_from_the_model(sd1: Path) -> None:
     backbone = extractor(sd1).load(CPU)
     backbone(some_crops(1), PAPER_LAYERS)
     assert not any(module._forward_hooks for module in backbone.model.unet.modules())
 
 
-def test_shared_noise_is_one_tensor_and_independent_noise_follows_the_content(sd1: Path) -> None:
+def test_shared_noise_is_one_tensor_and_independent_noise_depends_on_content(sd1: Path) -> None:
     crops = some_crops(3)
     twice = crops[[0, 1, 0]]
     shared = features(sd1, twice, [11])[11]
@@ -183,7 +183,7 @@ def test_shared_noise_is_one_tensor_and_independent_noise_follows_the_content(sd
     assert_close(features(sd1, other_mask, [11])[11][:2], shared[:2])
 
 
-def test_without_noise_the_latent_is_clean_and_the_timestep_still_counts(sd1: Path) -> None:
+def test_without_noise_the_latent_is_clean_and_the_timestep_still_matters(sd1: Path) -> None:
     crops, layers = some_crops(1), [8]
     spec = extractor(sd1, noise="none", timestep=261)
     backbone = spec.load(CPU)
@@ -234,7 +234,7 @@ def test_a_prompt_changes_the_features(sd1: Path) -> None:
     assert (plain - prompted).abs().max() > 1e-3
 
 
-def test_batches_are_sized_to_memory_when_none_is_given(sd1: Path) -> None:
+def test_batch_size_follows_memory_unless_it_is_given(sd1: Path) -> None:
     small, large = (extractor(sd1, input_size=s).load(Runtime(device="cpu")).batch for s in (128, 1024))
     assert small == 16  # more gain nothing on a CPU
     assert 1 <= large < small

@@ -80,7 +80,7 @@ def changed(folder: Path, target: Path, **tensors: float) -> Path:
 
 
 def plain_forward(folder: Path, crops: Crops) -> SimpleNamespace:
-    """What transformers itself gives: tokens behind every block, attentions, projections, the normed last tokens."""
+    """Outputs of transformers itself: tokens after every block, attentions, projections, the normalised last tokens."""
     model_type = folder.name
     cls = getattr(transformers, CLASS[model_type])
     model = cls.from_pretrained(folder, attn_implementation="eager").eval()
@@ -117,7 +117,7 @@ def test_every_block_and_facet_equals_a_plain_forward_of_transformers(folder: Pa
         assert_close(maps[layer], as_map(getattr(plain, facet)[layer], folder))
 
 
-def test_the_last_norm_is_applied_to_tokens_of_any_block_and_to_nothing_else(folder: Path) -> None:
+def test_the_last_norm_is_applied_to_tokens_of_any_block_only(folder: Path) -> None:
     crops, plain = some_crops(), plain_forward(folder, some_crops())
     maps = features(folder, crops, BLOCKS, facet="token", norm_last=True)
     for layer in BLOCKS:
@@ -171,9 +171,7 @@ def test_overlapping_patches_equal_plain_ones_of_the_shifted_image(folders: dict
 
 
 @pytest.mark.parametrize(("model_type", "stride"), [("vit", s) for s in (8, 4, 2, 1)] + [("dinov2", 7), ("dinov2", 14)])
-def test_a_token_lies_where_its_cell_is_centred(
-    folders: dict[str, Path], tmp_path: Path, model_type: str, stride: int
-) -> None:
+def test_a_token_is_centred_on_its_cell(folders: dict[str, Path], tmp_path: Path, model_type: str, stride: int) -> None:
     # a kernel that averages its patch sees, in an image that brightens evenly, the brightness at the patch's centre
     size, cells = SIZE[model_type], SIZE[model_type] // stride
     ramp = np.broadcast_to(np.arange(size, dtype=np.float32), (1, 3, size, size)).copy()
@@ -209,7 +207,7 @@ def test_binned_layers_hold_the_bins_of_the_plain_ones(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("stride", [None, 2])
-def test_the_same_features_whatever_the_batch(folder: Path, stride: int | None) -> None:
+def test_features_do_not_depend_on_the_batch(folder: Path, stride: int | None) -> None:
     crops = some_crops(4)
     backbone = extractor(folder, stride=stride, binned=[1]).load(CPU)
     together = backbone(crops, ALL)
@@ -283,7 +281,7 @@ def test_what_save_pretrained_writes_gives_the_same_features(folder: Path, tmp_p
     assert extractor(saved).recipe() != extractor(folder).recipe()
 
 
-def test_a_gated_mlp_is_loaded_as_dinov2_giant_has_it(tmp_path: Path) -> None:
+def test_the_gated_mlp_of_dinov2_giant_is_loaded(tmp_path: Path) -> None:
     torch.manual_seed(0)
     sizes = {"hidden_size": 48, "num_hidden_layers": 2, "num_attention_heads": 6, "image_size": 56, "patch_size": 14}
     model = transformers.Dinov2Model(transformers.Dinov2Config(**sizes, mlp_ratio=2, use_swiglu_ffn=True)).eval()
@@ -292,7 +290,7 @@ def test_a_gated_mlp_is_loaded_as_dinov2_giant_has_it(tmp_path: Path) -> None:
     assert maps[1].shape == (1, 48, 4, 4)
 
 
-def test_the_key_follows_the_bytes_and_not_the_place(folder: Path, tmp_path: Path) -> None:
+def test_the_key_depends_on_the_bytes_and_not_the_path(folder: Path, tmp_path: Path) -> None:
     copy = changed(folder, tmp_path / folder.name)
     here, there = extractor(folder), extractor(copy, revision="main", stride=PATCH[folder.name])
     assert here.recipe() == there.recipe()
@@ -376,7 +374,7 @@ def edit(folder: Path, **fields: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
 
-def test_a_place_without_safetensors_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_safetensors_is_named(tmp_path: Path) -> None:
     missing = refusal(tmp_path / "nowhere")
     assert missing.startswith(f"extract.weights: found '{tmp_path}/nowhere', which is not there, needs a folder")
     (tmp_path / "empty").mkdir()
@@ -389,7 +387,7 @@ def test_a_place_without_safetensors_is_told(tmp_path: Path) -> None:
     assert "model.safetensors: found only pytorch_model.bin, needs safetensors" in refusal(folder)
 
 
-def test_weights_that_are_cut_off_or_do_not_fit_are_told(tmp_path: Path) -> None:
+def test_weights_that_are_truncated_or_do_not_fit_are_named(tmp_path: Path) -> None:
     folder = write_vit(tmp_path / "vit", depth=2)
     whole = (folder / "model.safetensors").read_bytes()
     (folder / "model.safetensors").write_bytes(whole[: len(whole) // 2])
@@ -398,8 +396,8 @@ def test_weights_that_are_cut_off_or_do_not_fit_are_told(tmp_path: Path) -> None
     edit(folder, num_hidden_layers=3)
     assert "missing), needs all weights" in refusal(folder)
     edit(folder, num_hidden_layers=2, intermediate_size=200)
-    assert "tensor layers.0" in (told := refusal(folder)) or "tensor encoder.layer.0" in told
-    assert "found (96,), needs (200,), as config.json says" in told
+    assert "tensor layers.0" in (message := refusal(folder)) or "tensor encoder.layer.0" in message
+    assert "found (96,), needs (200,), as config.json says" in message
     edit(folder, patch_size=[8, 8])
     assert "config.json: found patch_size [8, 8], needs a whole number, 1 or more" in refusal(folder)
     edit(folder, hidden_size="wide")
@@ -408,7 +406,7 @@ def test_weights_that_are_cut_off_or_do_not_fit_are_told(tmp_path: Path) -> None
     assert "needs valid JSON" in refusal(folder)
 
 
-def test_a_hub_id_out_of_reach_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_unreachable_hub_id_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     for cls in (Dino, DinoV2):

@@ -1,4 +1,4 @@
-"""Where weights come from, what enters the key, and what is refused."""
+"""Sources of weights, the files that enter the key, and what is refused."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(original: Path, tmp_path: Path) -> Path:
-    """A copy that a test may spoil."""
+    """A copy that a test may modify."""
     return Path(shutil.copytree(original, tmp_path / "copy"))
 
 
@@ -49,7 +49,7 @@ def refusal(weights: object, **fields: object) -> str:
     return str(caught.value)
 
 
-def test_the_key_follows_the_bytes_and_not_the_place(original: Path, folder: Path) -> None:
+def test_the_key_depends_on_the_bytes_and_not_the_path(original: Path, folder: Path) -> None:
     here, there = extractor(original), extractor(folder, revision="main")
     assert here.recipe() == there.recipe()
     assert here.model == there.model == f"stable_diffusion-{here.recipe()['weights'][:8]}"
@@ -64,13 +64,13 @@ def test_every_file_that_is_read_enters_the_key(original: Path, folder: Path, na
     assert extractor(folder).recipe() != extractor(original).recipe()
 
 
-def test_the_noise_schedule_enters_the_key_and_is_obeyed(original: Path, folder: Path) -> None:
+def test_the_noise_schedule_enters_the_key_and_is_used(original: Path, folder: Path) -> None:
     edit(folder / "scheduler" / "scheduler_config.json", beta_end=0.02)
     assert extractor(folder).recipe() != extractor(original).recipe()
     assert extractor(folder).configs.alphas_cumprod[-1] < extractor(original).configs.alphas_cumprod[-1]
 
 
-def test_a_file_nobody_reads_does_not_enter_the_key(original: Path, folder: Path) -> None:
+def test_an_unused_file_does_not_enter_the_key(original: Path, folder: Path) -> None:
     (folder / "model_index.json").write_text("{}")
     (folder / "unet" / "diffusion_pytorch_model.bin").write_bytes(b"never opened")
     (folder / "unet" / "diffusion_pytorch_model.fp16.safetensors").write_bytes(b"nor this: there is full precision")
@@ -100,7 +100,7 @@ def test_half_precision_files_and_shards_are_found(original: Path, folder: Path)
     assert "00002-of-00002" in refusal(folder)
 
 
-def test_names_of_the_attention_before_diffusers_0_17_are_understood(original: Path, folder: Path) -> None:
+def test_attention_names_from_before_diffusers_0_17_are_read(original: Path, folder: Path) -> None:
     old = {"to_q": "query", "to_k": "key", "to_v": "value", "to_out.0": "proj_attn"}
     tensors = {}
     for name, tensor in load_file(folder / VAE).items():
@@ -119,7 +119,7 @@ def test_the_empty_prompt_needs_no_tokenizer(original: Path, folder: Path) -> No
     assert "extract.prompt: found 'a duck' and no tokenizer" in refusal(folder, prompt="a duck")
 
 
-def test_a_prompt_of_any_length_the_encoder_takes(original: Path) -> None:
+def test_a_prompt_may_be_as_long_as_the_encoder_allows(original: Path) -> None:
     assert extractor(original).source.encode_prompt("a " * 75).shape == (1, 77, 32)
     assert "extract.prompt: found 78 tokens, needs at most 77" in refusal(original, prompt="a " * 76)
 
@@ -130,7 +130,7 @@ def test_the_default_schedule_is_that_of_stable_diffusion() -> None:
     np.testing.assert_allclose(alphas_cumprod({}), np.cumprod(1 - betas), rtol=1e-4)
 
 
-def test_a_path_is_told_from_a_hub_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_and_hub_ids_are_distinguished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "here").mkdir()
     for path in ("/a", "./a", "../a", "~/a", "a/b.safetensors", "b.ckpt", "here"):
@@ -139,7 +139,7 @@ def test_a_path_is_told_from_a_hub_id(tmp_path: Path, monkeypatch: pytest.Monkey
         assert not is_local(hub_id)
 
 
-def test_a_hub_id_out_of_reach_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_unreachable_hub_id_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     message = refusal("someone/no-such-model")
@@ -154,7 +154,7 @@ def _unreachable(*args: object, **kwargs: object) -> None:
     raise LocalEntryNotFoundError("Got: ConnectError: no route\nAn error happened while trying to locate the files")
 
 
-def test_a_missing_place_is_named(tmp_path: Path) -> None:
+def test_a_missing_path_is_named(tmp_path: Path) -> None:
     assert refusal(tmp_path / "nowhere").startswith("extract.weights: found")
     assert "unet/config.json: found no such file (configs of: nothing)" in refusal(tmp_path)
 

@@ -59,7 +59,7 @@ def library_input(folder: Path, image: Image) -> torch.Tensor:
 
 
 def by_plain_loop(folder: Path, image: Image) -> list[tuple[np.ndarray, float, float]]:
-    """Mask, predicted IoU and stability of every point's three masks: one point and one whole forward at a time."""
+    """Mask, predicted IoU and stability of every point's three masks, by one full forward pass per point."""
     model = (SamModel if is_first(folder) else Sam2Model).from_pretrained(folder).eval()
     (h, w), used, pixels = image.rgb.shape[:2], used_hw(folder, image), library_input(folder, image)
     found = []
@@ -88,7 +88,7 @@ def test_proposals_are_those_of_a_plain_loop_through_the_library(folder: Path):
     ours = proposed(folder, image)
     assert len(ours) == len(expected) > 3
     np.testing.assert_allclose([p.confidence for p in ours], [iou for _, iou, _ in expected], atol=1e-4)
-    # a logit beside 0 may fall on either side, and of equal confidence two masks may change places
+    # a logit near 0 may fall on either side, and masks of equal confidence may swap
     assert (
         np.median([(decode_rle(p.rle) == mask).mean() for p, (mask, _, _) in zip(ours, expected, strict=True)]) > 0.999
     )
@@ -100,18 +100,18 @@ def test_input_is_resized_as_the_library_does(folder: Path):
     assert (ours - library_input(folder, image)).abs().max() < 0.018  # Pillow rounds twice to 8 bit: 1 / 255 / 0.224
 
 
-def test_thresholds_leave_out_what_they_say(folder: Path):
+def test_thresholds_drop_masks_below_them(folder: Path):
     whole = proposed(folder)
     middle = float(np.median([p.confidence for p in whole]))
     assert proposed(folder, min_iou=min(max(middle, 0.0), 1.0)) == [p for p in whole if p.confidence > min(middle, 1.0)]
     least = float(np.median([decode_rle(p.rle).mean() for p in whole]))
     assert proposed(folder, min_mask_size=least) == [p for p in whole if decode_rle(p.rle).mean() > least]
     stable = [s for m, iou, s in by_plain_loop(folder, photograph()) if iou > 0 and m.mean() > 3e-4]
-    # a mask beside the threshold may fall on either side: see the resized image above
+    # a mask near the threshold may fall on either side: see the resized image above
     assert abs(len(proposed(folder, min_stability=0.8)) - sum(s > 0.8 for s in stable)) <= 1
 
 
-def test_near_duplicates_and_small_boxes_go(folder: Path):
+def test_near_duplicates_and_small_boxes_are_dropped(folder: Path):
     few = proposed(folder, nms_iou=0.5)
     assert 0 < len(few) < len(proposed(folder))
     assert few == sorted(few, key=lambda p: -p.confidence)
@@ -126,17 +126,17 @@ def test_boxes_are_those_of_the_masks_and_masks_have_the_size_of_the_image(folde
         assert proposal.bbox_xyxy == mask_bbox(coco.decode(proposal.rle).astype(bool))
 
 
-def test_the_batch_changes_no_mask(folder: Path):
+def test_masks_do_not_depend_on_the_batch(folder: Path):
     ours, theirs = proposed(folder), proposed(folder, batch=2)
     assert [p.bbox_xyxy for p in ours] == [p.bbox_xyxy for p in theirs]
     np.testing.assert_allclose([p.confidence for p in ours], [p.confidence for p in theirs], atol=1e-5)
 
 
-def test_an_image_of_which_nothing_is_reliable_has_no_proposal(folder: Path):
+def test_an_image_without_a_reliable_mask_has_no_proposal(folder: Path):
     assert proposed(folder, min_stability=1.0) == []
 
 
-def test_key_follows_the_weights_not_their_place(sam1: Path, tmp_path: Path):
+def test_key_depends_on_the_weights_not_their_path(sam1: Path, tmp_path: Path):
     copy = tmp_path / "elsewhere"
     copy.mkdir()
     for path in sam1.iterdir():
@@ -157,14 +157,14 @@ def test_stability_is_the_overlap_of_two_thresholds():
     assert compute_stability(logits, offset=1.0).tolist() == pytest.approx([1 / 3, 0.0])
 
 
-def test_weights_that_are_not_there_are_told(tmp_path: Path):
+def test_missing_weights_are_named(tmp_path: Path):
     with pytest.raises(BadInput, match=r"detect\.proposals\.weights: found .*does not exist"):
         Sam(weights=str(tmp_path / "nowhere")).recipe()
     with pytest.raises(BadInput, match=r"config\.json"):
         Sam(weights=str(tmp_path)).recipe()
 
 
-def test_another_model_is_told(tmp_path: Path):
+def test_another_model_is_named(tmp_path: Path):
     (tmp_path / "config.json").write_text('{"model_type": "dinov2"}')
     with pytest.raises(BadInput, match="model_type 'dinov2', needs one of sam, sam2") as raised:
         Sam(weights=str(tmp_path)).recipe()
@@ -178,7 +178,7 @@ def test_pickled_weights_are_never_opened(sam1: Path, tmp_path: Path):
         Sam(weights=str(tmp_path)).recipe()
 
 
-def test_weights_that_lack_a_tensor_or_are_cut_off_are_told(sam1: Path, tmp_path: Path):
+def test_weights_that_lack_a_tensor_or_are_truncated_are_named(sam1: Path, tmp_path: Path):
     (tmp_path / "config.json").write_bytes((sam1 / "config.json").read_bytes())
     tensors = load_file(sam1 / "model.safetensors")
     del tensors["mask_decoder.iou_token.weight"]
@@ -209,7 +209,7 @@ def test_yaml_lists_every_field_with_its_default():
     assert build(Sam, values, where="detect.proposals") == Sam()
 
 
-def test_points_whose_masks_are_all_unsure_propose_nothing(folder: Path):
+def test_points_with_unreliable_masks_give_no_proposal(folder: Path):
     every = [p.confidence for p in proposed(folder)]
     sure = [p.confidence for p in proposed(folder, batch=1, min_iou=1.0)]  # random weights predict any IoU
     assert sure == pytest.approx([c for c in every if c > 1.0], abs=1e-4)

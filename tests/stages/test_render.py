@@ -38,7 +38,7 @@ def quad(z_mm: float, half_mm: float = 100.0, **skin) -> Mesh:
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_yaml_says_the_defaults_of_its_class(name):
+def test_yaml_lists_the_defaults_of_its_class(name):
     values = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     assert values.pop("_target_") == f"pipeline.stages.render.{name}.{VARIANTS[name].__name__}"
     assert list(values) == [f.name for f in fields(VARIANTS[name])]
@@ -47,7 +47,7 @@ def test_yaml_says_the_defaults_of_its_class(name):
 
 
 @both
-def test_a_scaled_object_gives_the_same_pictures_and_scaled_depth(renderer):
+def test_a_scaled_object_gives_equal_images_and_scaled_depth(renderer):
     mesh = make_object(1)
     spec = renderer(size=64, count=3)
     K, T, hw = spec.cameras(mesh)
@@ -62,7 +62,7 @@ def test_a_scaled_object_gives_the_same_pictures_and_scaled_depth(renderer):
 
 @both
 @pytest.mark.parametrize("viewpoints", ["icosphere_upper", "icosphere", "fibonacci", "superfibonacci"])
-def test_an_object_away_from_its_origin_is_whole_in_every_template(renderer, viewpoints):
+def test_an_object_away_from_its_origin_is_inside_every_template(renderer, viewpoints):
     mesh = make_object(2)
     away = replace(mesh, vertices=mesh.vertices + np.array([500.0, -300.0, 80.0]))
     few = renderer(size=48, count=8, viewpoints=viewpoints, supersample=1)
@@ -105,7 +105,7 @@ def test_a_ball_has_the_depth_of_a_ball(renderer):
 
 @both
 def test_pixel_centres_are_integers(renderer):
-    """The edge x = 0 of a plane at depth f falls on pixel cx: just left of cx is plane, just right of it nothing."""
+    """The edge x = 0 of a plane at depth f is at pixel cx: plane just left of cx, background just right of it."""
     mesh = Mesh(
         np.array([[-90, -90, 0], [0, -90, 0], [0, 90, 0], [-90, 90, 0]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]])
     )
@@ -120,7 +120,7 @@ def test_pixel_centres_are_integers(renderer):
 
 
 @both
-def test_colours_texture_and_grey_come_out_as_they_went_in(renderer):
+def test_colours_texture_and_grey_are_reproduced(renderer):
     colours = np.array([[255, 0, 0], [255, 0, 0], [0, 0, 255], [0, 0, 255]], np.uint8)
     texture = np.zeros((64, 64, 3), np.uint8)
     texture[:32] = (10, 200, 30)  # upper half of the image, v > 0.5
@@ -161,7 +161,7 @@ def test_background_is_black_and_the_outline_has_no_dark_rim():
     assert depth.dtype == np.float32
 
 
-def test_supersampling_takes_the_mean_of_a_pixel_not_its_centre():
+def test_supersampling_averages_over_the_pixel():
     colours = np.zeros((2 * 400, 3), np.uint8)
     colours[::4] = colours[1::4] = 255
     x = np.repeat(np.arange(400) // 2 * 1.0 + np.arange(400) % 2, 2)  # stripes of 1 mm, black and white
@@ -183,7 +183,7 @@ def test_supersampling_takes_the_mean_of_a_pixel_not_its_centre():
     assert spread[4] < 25
 
 
-def test_depth_of_whole_images_takes_a_camera_for_each():
+def test_render_depth_accepts_one_camera_per_pose():
     mesh = make_object(3)
     T = look_at(np.array([[0.0, -600, 100], [500, 200, 300]]))
     K = np.array([[[400.0, 0, 70], [0, 410, 40], [0, 0, 1]], [[300.0, 0, 60], [0, 310, 50], [0, 0, 1]]])
@@ -201,7 +201,7 @@ def test_depth_of_whole_images_takes_a_camera_for_each():
         )
 
 
-def test_an_object_out_of_the_image_behind_or_around_the_camera_is_no_error():
+def test_an_object_outside_the_image_behind_or_around_the_camera_is_no_error():
     mesh = ball(50)
     K = np.array([[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]])
     T = np.tile(np.eye(4), (4, 1, 1))
@@ -227,7 +227,7 @@ def test_surface_points_face_the_camera_and_agree_with_the_depth_map():
     assert albedo.max() > 50
 
 
-def test_no_ray_slips_through_an_edge():
+def test_no_ray_passes_through_an_edge():
     """A camera in the plane of many edges: pixel columns run along meridians of the ball."""
     mesh = ball(50, level=2)
     K = np.array([[300.0, 0, 32], [0, 300.0, 32], [0, 0, 1]])
@@ -263,7 +263,7 @@ def test_both_renderers_agree_on_real_meshes(rel, bop_mini):
     assert np.abs(rgb.astype(float) - rgb_gl)[seen & seen_gl].mean() < 3
 
 
-def test_auto_takes_the_ray_caster_here_and_keeps_every_field():
+def test_auto_resolves_to_the_ray_caster_with_every_field():
     chosen = Auto(size=64, count=7, viewpoints="superfibonacci").resolve()
     assert chosen == Raycast(size=64, count=7, viewpoints="superfibonacci")
     assert chosen.recipe()["kind"] == "render.raycast"

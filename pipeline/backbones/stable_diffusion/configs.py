@@ -28,8 +28,8 @@ def check_unet(config: Mapping[str, Any], where: Path) -> None:
     for name in ("layers_per_block", "cross_attention_dim"):
         if not isinstance(config[name], int):
             raise BadInput(where, found=f"{name} {config[name]!r}", needed="one whole number")
-    if strange := sorted(set(config.get("up_block_types", ())) - {"UpBlock2D", "CrossAttnUpBlock2D"}):
-        raise BadInput(where, found=f"up_block_types {strange[0]!r}", needed="UpBlock2D or CrossAttnUpBlock2D")
+    if unknown := sorted(set(config.get("up_block_types", ())) - {"UpBlock2D", "CrossAttnUpBlock2D"}):
+        raise BadInput(where, found=f"up_block_types {unknown[0]!r}", needed="UpBlock2D or CrossAttnUpBlock2D")
 
 
 def check_class(config: Mapping[str, Any], name: str, where: Path) -> None:

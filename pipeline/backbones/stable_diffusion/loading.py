@@ -78,7 +78,7 @@ def build_text_encoder(config: Mapping[str, Any], where: object) -> tuple[nn.Mod
     return model, getattr(model, "text_model", model)
 
 
-def modernize_name(name: str) -> str:
+def to_current_name(name: str) -> str:
     """A weight's current name: without the text encoder's wrapper; the VAE's attention as of diffusers 0.17."""
     name = name.removeprefix("text_model.")
     old = re.match(r"(.+\.attentions\.\d+\.)(query|key|value|proj_attn)(\.(?:weight|bias))$", name)
@@ -86,7 +86,7 @@ def modernize_name(name: str) -> str:
 
 
 def load_weights(
-    model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = modernize_name
+    model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = to_current_name
 ) -> None:
     """Copy weights from safetensors files into a model. Raises BadInput for missing weights and other shapes.
 
@@ -100,10 +100,13 @@ def load_weights(
         stored = {name: s for s in tensor_shapes(path) if (name := name_of(s)) is not None and name in missing}
         for names in _portions(stored, missing):
             with safe_open(str(path), framework="pt") as tensors, torch.no_grad():
-                for name in names:
-                    where = f"{path}, tensor {stored[name]}"
-                    copy_weight(tensors.get_tensor(stored[name]), missing.pop(name), where)
+                _copy_portion(tensors, [(stored[name], missing.pop(name)) for name in names], path)
     check_missing(sorted(missing), paths[0])
+
+
+def _copy_portion(tensors: Any, pairs: Iterable[tuple[str, nn.Parameter]], path: Path) -> None:
+    for stored_name, parameter in pairs:
+        copy_weight(tensors.get_tensor(stored_name), parameter, f"{path}, tensor {stored_name}")
 
 
 def _portions(names: Iterable[str], parameters: Mapping[str, nn.Parameter]) -> list[list[str]]:

@@ -55,8 +55,8 @@ class GtMask(Detector):
         box = gt.bbox_visib_xyxy or (0.0, 0.0, 0.0, 0.0)
         try:
             mask = dataset.mask(*ids, gt.gt_id, visible=self.visible)
-        except BadInput as fault:
-            unread = f"{path}: found {fault.found}, needs {fault.needed}"  # a relative path: defects enter keys
+        except BadInput as error:
+            unread = f"{path}: found {error.found}, needs {error.needed}"  # a relative path: defects enter keys
             return Detection(*ids, gt.obj_id, 1.0, 0.0, box, None, gt.gt_id, unread)
         defect, size_hw = None, dataset.image_size(*ids)
         if mask.shape != size_hw:

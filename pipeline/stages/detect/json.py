@@ -101,8 +101,8 @@ def _read_detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, i
             raise ValueError(f"score is {abbreviate(entry['score'])}, not a finite number")
         rle = None if entry.get("segmentation") is None else _read_mask(entry["segmentation"], size_hw)
         box = _read_box(entry.get("bbox"), rle, size_hw)
-    except ValueError as fault:
-        return Detection(*ids, score if math.isfinite(score) else 0.0, time_s, (0.0,) * 4, defect=str(fault))
+    except ValueError as error:
+        return Detection(*ids, score if math.isfinite(score) else 0.0, time_s, (0.0,) * 4, defect=str(error))
     return Detection(*ids, score, time_s, box, rle)
 
 

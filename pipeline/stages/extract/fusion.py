@@ -100,11 +100,11 @@ class Fusion(Extractor):
         try:
             with _name_member("second"):
                 return channels + self.second.feature_shape(other)[0], h, w
-        except BadInput as fault:
-            if not fault.where.endswith(" layer"):
+        except BadInput as error:
+            if not error.where.endswith(" layer"):
                 raise
-            found = f"layer {other} of the second extractor beside layer {layer}"
-            raise BadInput("extract.layers", found=found, needed=fault.needed) from None
+            found = f"layer {other} of the second extractor, paired with layer {layer}"
+            raise BadInput("extract.layers", found=found, needed=error.needed) from None
 
     def partner(self, layer: int) -> int:
         """The second extractor's layer that is paired with ``layer``. Raises BadInput where there is none."""
@@ -164,8 +164,8 @@ def _name_member(member: str) -> Iterator[None]:
     """Name the member in errors about its fields: extract.weights becomes extract.first.weights."""
     try:
         yield
-    except BadInput as fault:
-        if not fault.where.startswith("extract"):
+    except BadInput as error:
+        if not error.where.startswith("extract"):
             raise
-        where = f"extract.{member}{fault.where.removeprefix('extract')}"
-        raise BadInput(where, found=fault.found, needed=fault.needed) from None
+        where = f"extract.{member}{error.where.removeprefix('extract')}"
+        raise BadInput(where, found=error.found, needed=error.needed) from None

@@ -124,7 +124,7 @@ def ray_directions(
 class MeshMemo(Generic[Value]):
     """One value per mesh, kept while the mesh is alive; the oldest is dropped beyond ``max_meshes``.
 
-    A mesh is rendered many times, and building its scene takes longer than a view.
+    A mesh is rendered many times, and building its scene takes longer than rendering a view.
     """
 
     def __init__(self, max_meshes: int) -> None:
