@@ -1,11 +1,13 @@
 import json
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.spatial.distance import cdist
 
 from pipeline.errors import BadInput
 from pipeline.functional.shading import texture_colour
@@ -243,19 +245,56 @@ def test_parts_of_a_scene_are_transformed(tmp_path):
     assert (mesh.colours[~right] == [255, 0, 0]).all()
 
 
-@pytest.mark.parametrize("points", ["cloud", "sphere", "flat", "line"])
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def mesh_of(vertices: np.ndarray) -> Mesh:
+    """A mesh whose faces use all vertices."""
+    return Mesh(vertices, np.resize(np.arange(len(vertices)), (-(-len(vertices) // 3), 3)))
+
+
+@pytest.mark.parametrize("points", ["cloud", "sphere", "flat", "line", "ring", "half ball", "constant width", "two"])
 def test_diameter_equals_the_largest_pairwise_distance(points):
     rng = np.random.default_rng(1)
-    cloud = rng.normal(size=(200, 3)) * [3, 1, 0.5] + 1000
+    cloud = rng.normal(size=(3000, 3)) * [3, 1, 0.5] + 1000
+    ball = unit(rng.normal(size=(3000, 3)))
+    tetrahedron = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 8**0.5
+    along = ball @ tetrahedron.T
     vertices = {
         "cloud": cloud,
-        "sphere": cloud / np.linalg.norm(cloud - cloud.mean(0), axis=-1, keepdims=True),
+        "sphere": ball * 50 + 7,
         "flat": cloud * [1, 1, 0],
         "line": cloud * [1, 0, 0],
+        "ring": unit(ball * [1, 1, 0]) * 30,
+        "half ball": np.abs(ball),
+        # where balls about a tetrahedron's corners meet: nearly all points have a partner at nearly the diameter
+        "constant width": ball * np.min(along + (along**2 + 1 - 3 / 8) ** 0.5, axis=1)[:, None],
+        "two": cloud[:2],
     }[points]
-    brute = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1).max()
+    brute = cdist(vertices, vertices).max()
     # different order of summation
-    assert diameter_mm(Mesh(vertices, np.array([[0, 1, 2]]))) == pytest.approx(brute, rel=1e-12)
+    assert diameter_mm(mesh_of(vertices)) == pytest.approx(brute, rel=1e-13)
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "ball", "both"])
+def test_diameter_of_a_fine_round_mesh_is_exact_within_seconds(shape):
+    """On these, no vertex can be ruled out by its distance from the centre alone."""
+    cylinder = trimesh.creation.cylinder(radius=30, height=120, sections=20_000).vertices
+    ball = trimesh.creation.uv_sphere(radius=50, count=[200, 200]).vertices
+    vertices, expected = {
+        "cylinder": (cylinder, 18_000**0.5),
+        "ball": (ball, 100),
+        "both": (np.concatenate([cylinder, ball]), 18_000**0.5),
+    }[shape]
+    start = time.process_time()
+    assert diameter_mm(mesh_of(np.asarray(vertices))) == pytest.approx(expected, rel=1e-13)
+    assert time.process_time() - start < 5
+
+
+def test_a_vertex_that_no_face_uses_does_not_change_the_diameter():
+    vertices = np.concatenate([SQUARE, [[5000, 0, 0]]])
+    assert diameter_mm(Mesh(vertices, SQUARE_FACES)) == pytest.approx(200**0.5)
 
 
 def test_real_textured_and_coloured_meshes_can_be_read(bop_mini):
