@@ -9,6 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from command import Ran, run_dzop
 
 from pipeline.report.run_records import read_run_records
 from pipeline.synthetic.scenes import write_dataset
@@ -30,120 +31,147 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def command(tmp_path, scene, cache):
+    """Arguments of ``dzop`` on the scene."""
+
     def build(*arguments: str) -> list[str]:
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"store.root={cache}")
         flags = [argument for argument in arguments if argument.startswith("-")]  # argparse wants them first
         overrides = [argument for argument in arguments if not argument.startswith("-")]
-        return [sys.executable, "-m", "pipeline", *flags, *dataset, *SMALL, f"out={tmp_path}/results", *overrides]
+        return [*flags, *dataset, *SMALL, f"out={tmp_path}/results", *overrides]
 
     return build
 
 
-def ran(command: list[str]) -> subprocess.CompletedProcess:
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+@pytest.fixture
+def dzop(capsys, monkeypatch, command):
+    """Run ``dzop`` in this process."""
+    return lambda *arguments: run_dzop(capsys, monkeypatch, *command(*arguments))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", [(), JOBLIB, SUBMITIT], ids=["basic", "joblib", "submitit"])
-def test_a_failed_job_stops_no_other_and_is_named_at_the_end_and_recorded(command, tmp_path, launcher):
-    if launcher == SUBMITIT:
-        pytest.importorskip("submitit", reason="needs submitit: pip install 'dzop[submitit]'")
-    done = ran(command("-m", "cluster.count=4,-1,6", "solve.min_inliers=4", *launcher))
-    assert done.returncode == 1
-    last = done.stderr.strip().splitlines()[-1]
+@pytest.fixture
+def start(tmp_path):
+    """Start ``dzop`` as a process whose working directory goes with the test."""
+
+    def popen(arguments: list[str]) -> subprocess.Popen:
+        command, env = [sys.executable, "-m", "pipeline", *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
+        pipe = subprocess.PIPE
+        return subprocess.Popen(command, cwd=tmp_path, env=env, stdout=pipe, stderr=pipe, text=True)
+
+    return popen
+
+
+def check_failed_job(status: int | str | None, err: str, results: Path, page: Ran) -> None:
+    """One job of several had cluster.count=-1: the end of the output, the rows and the page name it."""
+    assert status == 1
+    last = err.strip().splitlines()[-1]
     assert last.startswith("error: 1 of the sweep's jobs failed: ")
     assert "cluster.count=-1 " in last
     assert "cluster.count: found -1, needs greater than or equal to 1" in last
-    assert "Traceback" not in done.stderr
-    rows = {row.config["cluster"]["count"]: row for row in read_run_records(tmp_path / "results")}
-    assert {count: row.status for count, row in rows.items()} == {4: "done", -1: "failed", 6: "done"}
-    assert "cluster.count=-1" in rows[-1].overrides
-    page = ran([sys.executable, "-m", "pipeline", "step=report", f"out={tmp_path}/results"])
-    assert page.returncode == 0, page.stderr
-    assert "cluster.count=-1 solve.min_inliers=4 (cluster.count: found -1" in page.stdout
-    assert "cluster.count: found -1" in (tmp_path / "results" / "report" / "index.html").read_text()
+    assert "Traceback" not in err
+    records = {record.config["cluster"]["count"]: record for record in read_run_records(results)}
+    assert {record.status for count, record in records.items() if count > 0} == {"done"}
+    assert records[-1].status == "failed"
+    assert "cluster.count=-1" in records[-1].overrides
+    assert page.status == 0, page.err
+    assert "cluster.count=-1 solve.min_inliers=4 (cluster.count: found -1" in page.out
+    assert "cluster.count: found -1" in (results / "report" / "index.html").read_text()
+
+
+def test_a_failed_job_stops_no_other_and_is_named_at_the_end_and_recorded(dzop, tmp_path):
+    done = dzop("-m", "cluster.count=4,-1,6", "solve.min_inliers=4")
+    check_failed_job(done.status, done.err, tmp_path / "results", dzop("step=report"))
+    assert len(read_run_records(tmp_path / "results")) == 3
 
 
 @pytest.mark.slow
-def test_a_nan_fails_only_its_own_job(command, tmp_path):
-    done = ran(command("-m", "solve.threshold_px=nan,8"))
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert done.stderr.strip().splitlines()[-1].startswith("error: 1 of the sweep's jobs failed: ")
+@pytest.mark.parametrize("launcher", [JOBLIB, SUBMITIT], ids=["joblib", "submitit"])
+def test_a_failed_job_of_another_launcher_stops_no_other_and_is_recorded(command, dzop, start, tmp_path, launcher):
+    if launcher == SUBMITIT:
+        pytest.importorskip("submitit", reason="needs submitit: pip install 'dzop[submitit]'")
+    done = start(command("-m", "cluster.count=-1,6", "solve.min_inliers=4", *launcher))
+    _, err = done.communicate(timeout=300)
+    check_failed_job(done.returncode, err, tmp_path / "results", dzop("step=report"))
+    assert len(read_run_records(tmp_path / "results")) == 2
+
+
+def test_a_nan_fails_only_its_own_job(dzop, tmp_path):
+    done = dzop("-m", "solve.threshold_px=nan,8")
+    assert done.status == 1
+    assert "Traceback" not in done.err
+    assert done.err.strip().splitlines()[-1].startswith("error: 1 of the sweep's jobs failed: ")
     rows = {row.status: row.config["solve"]["threshold_px"] for row in read_run_records(tmp_path / "results")}
     assert rows == {"failed": "nan", "done": 8}
 
 
 @pytest.mark.slow
-def test_a_closed_pipe_records_no_failed_job(command, tmp_path):
-    jobs = subprocess.Popen(
-        command("-m", "cluster.count=3,4"), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+def test_a_closed_pipe_records_no_failed_job(command, start, tmp_path):
+    jobs = start(command("-m", "cluster.count=3,4"))
     jobs.stdout.close()
-    _, stderr = jobs.communicate(timeout=300)
-    assert "jobs failed" not in stderr.decode()
+    assert "jobs failed" not in jobs.stderr.read()
+    assert jobs.wait(timeout=300) is not None
     assert not list(tmp_path.glob("results/rows/*.json"))
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_reported_in_one_line_and_a_rerun_resumes(command, tmp_path):
-    jobs = command("-m", "cluster.count=3,4,5,6,7,8,9,10", *JOBLIB)
+def test_a_killed_worker_is_reported_in_one_line_and_a_rerun_resumes(command, start, tmp_path):
+    jobs = command("-m", "cluster.count=3,4,5,6,7,8", *JOBLIB)
     rows = tmp_path / "results" / "rows"
-    sweep = subprocess.Popen(jobs, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    limit = time.monotonic() + 120
-    while not list(rows.glob("*.json")) and time.monotonic() < limit:
-        time.sleep(0.01)
+    sweep = start(jobs)
+    wait_for(rows, 1)
     workers = [p for p in psutil.Process(sweep.pid).children() if any("popen_loky" in word for word in p.cmdline())]
     workers[0].kill()
-    _, stderr = sweep.communicate(timeout=300)
+    _, err = sweep.communicate(timeout=300)
     assert sweep.returncode == 1
-    assert "Traceback" not in stderr
+    assert "Traceback" not in err
     # the workers' own watcher may print the last line
-    assert any(line.startswith("error: a process of the sweep was killed") for line in stderr.splitlines())
+    assert any(line.startswith("error: a process of the sweep was killed") for line in err.splitlines())
     finished = len(list(rows.glob("*.json")))
-    again = ran(jobs)
-    assert again.returncode == 0, again.stderr
-    assert again.stdout.count("already finished: ") == finished
-    assert len(list(rows.glob("*.json"))) == 8
+    again = start(jobs)
+    out, err = again.communicate(timeout=300)
+    assert again.returncode == 0, err
+    assert out.count("already finished: ") == finished
+    assert len(list(rows.glob("*.json"))) == 6
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_resumes_where_it_stopped(command, tmp_path):
-    jobs = command("-m", "cluster.count=3,4,5,6,7,8,9,10")
+def test_a_killed_sweep_resumes_where_it_stopped(command, dzop, start, tmp_path):
+    jobs = "-m", "cluster.count=3,4,5,6,7,8,9,10"
     rows = tmp_path / "results" / "rows"
-    sweep = subprocess.Popen(jobs, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    limit = time.monotonic() + 120
-    while len(list(rows.glob("*.json"))) < 3 and time.monotonic() < limit:
-        time.sleep(0.01)
+    sweep = start(command(*jobs))
+    wait_for(rows, 3)
     sweep.send_signal(signal.SIGKILL)
     sweep.communicate()
     finished = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in rows.glob("*.json")}
     assert 3 <= len(finished) < 8
-    again = ran(jobs)
-    assert again.returncode == 0, again.stderr
-    assert again.stdout.count("already finished: ") == len(finished)
+    again = dzop(*jobs)
+    assert again.status == 0, again.err
+    assert again.out.count("already finished: ") == len(finished)
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in finished} == finished
     assert len(list(rows.glob("*.json"))) == 8
     assert [row.counts["template features"]["computed"] for row in read_run_records(tmp_path / "results")].count(0) >= 7
 
 
-@pytest.mark.slow
-def test_a_finished_job_is_repeated_when_its_files_are_gone(command, tmp_path, scene):
-    job = command("-m", "cluster.count=5")
-    assert ran(job).returncode == 0
+def wait_for(rows: Path, count: int) -> None:
+    limit = time.monotonic() + 120
+    while len(list(rows.glob("*.json"))) < count and time.monotonic() < limit:
+        time.sleep(0.01)
+
+
+def test_a_finished_job_is_repeated_when_its_files_are_gone(dzop, tmp_path):
+    job = "-m", "cluster.count=5"
+    assert dzop(*job).status == 0
     (csv,) = (tmp_path / "results").glob("*/*/*.csv")
     os.remove(csv)
-    again = ran(job)
-    assert "already finished" not in again.stdout
+    again = dzop(*job)
+    assert "already finished" not in again.out
     assert csv.exists()
-    assert "already finished" in ran(job).stdout
+    assert "already finished" in dzop(*job).out
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("sweep", "jobs"), [("correspondence", 4), ("ladder", 4), ("theta", 6)])
-def test_a_sweep_yaml_records_every_job(command, tmp_path, sweep, jobs):
-    done = ran(command(f"sweep={sweep}"))
-    assert done.returncode == 0, done.stderr
+def test_a_sweep_yaml_records_every_job(dzop, tmp_path, sweep, jobs):
+    done = dzop(f"sweep={sweep}")
+    assert done.status == 0, done.err
     rows = read_run_records(tmp_path / "results")
     assert len(rows) == jobs
     assert {row.sweep for row in rows} == {sweep}
