@@ -15,7 +15,7 @@ import torch
 from jaxtyping import install_import_hook
 
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-install_import_hook(["pipeline.functional"], "beartype.beartype")
+install_import_hook(["pipeline"], "typecheck.check_types")
 torch.set_num_threads(int(os.environ.get("DZOP_TEST_THREADS", "2")))
 
 ROOT = Path(__file__).resolve().parents[1]

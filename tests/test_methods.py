@@ -101,7 +101,7 @@ def test_a_method_answers_photographs(
     data = open_dataset(bop_mini / name, name=name)
     im_id = next(target.im_id for target in data.targets if target.obj_id == obj_id)
     asked = (f"dataset={name}", f"dataset.root={bop_mini / name}", f"select.objects=[{obj_id}]",
-             f"select.images=[{im_id}]", f"store.root={cache}")  # fmt: skip
+             f"select.images=[{im_id}]", "render.viewpoints=superfibonacci", f"store.root={cache}")  # fmt: skip
     detect = [override.format(bop_mini=bop_mini) for override in detect]
     ran = run_dzop(capsys, monkeypatch, *asked, *detect, *weights, *SMALL, f"method={method}", *METHODS[method])
     assert ran.status == 0, ran.err

@@ -99,6 +99,10 @@ def with_saliency(fused: FusedPair) -> FusedPair:
     return replace(fused, query_saliency=salient, template_saliency=salient.flip(-1))
 
 
+def one_cluster(pair: FusedPair) -> Clusters:
+    return Clusters(pair.query_mask.long() - 1, pair.template_mask.long() - 1, torch.tensor([[0, 0]]))
+
+
 def toy_crops() -> Crops:
     rng = np.random.default_rng(RNG_SEED)
     rgb = np.kron(rng.integers(0, 256, (1, 16, 16, 3)), np.ones((1, 8, 8, 1))).astype(np.uint8)
@@ -128,7 +132,7 @@ def summary(name: str) -> list[float]:
         return [*found.index.tolist(), *found.score.tolist(), found.margin]
     if name == "correspond/oracle":
         px = torch.arange(40, dtype=torch.float64).reshape(20, 2) * 1.6
-        found = spec(toy_pair(), None, crop_size=64, truth=TrueMatches(px, px + 0.25, disc(64)))
+        found = spec(toy_pair(), one_cluster(toy_pair()), crop_size=64, truth=TrueMatches(px, px + 0.25, disc(64)))
         return [float(len(found.similarity)), *found.query_px[:3].flatten().tolist()]
     if stage == "match":
         bank = toy_maps(9)[spec.layer]
@@ -144,8 +148,7 @@ def summary(name: str) -> list[float]:
         return [float(len(found.pairs)), float((found.query_label >= 0).sum()), float(found.query_label.double().std())]
     if stage == "correspond":
         pair = toy_pair()
-        one = Clusters(pair.query_mask.long() - 1, pair.template_mask.long() - 1, torch.tensor([[0, 0]]))
-        found = spec(pair, one, crop_size=64)
+        found = spec(pair, one_cluster(pair), crop_size=64)
         return [float(len(found.similarity)), *found.similarity[:3].tolist(), *found.template_px[:3].flatten().tolist()]
     if stage == "solve":
         solution = spec(*toy_points())

@@ -40,7 +40,8 @@ class FailedJobs:
 
     def read(self) -> list[tuple[list[str], str]]:
         """Overrides and error message of every failed job."""
-        return [json.loads(path.read_text()) for path in sorted(self.folder.glob("*"))]
+        failed = [json.loads(path.read_text()) for path in sorted(self.folder.glob("*"))]
+        return [(overrides, message) for overrides, message in failed]
 
     def remove(self) -> None:
         """Delete the folder."""
