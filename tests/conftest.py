@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from jaxtyping import install_import_hook
@@ -19,7 +20,20 @@ install_import_hook(["pipeline"], "typecheck.check_types")
 torch.set_num_threads(int(os.environ.get("DZOP_TEST_THREADS", "2")))
 
 ROOT = Path(__file__).resolve().parents[1]
+MEMORY = Path("/dev/shm")
 TEST_DATA = Path(os.environ.get("DZOP_TEST_DATA") or ROOT.parent / "shared" / "bop_mini").absolute()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Put temporary folders in memory where there is plenty: disks are slow to remove thousands of small files.
+
+    PYTEST_DEBUG_TEMPROOT or --basetemp choose another place.
+    """
+    chosen = config.option.basetemp or "PYTEST_DEBUG_TEMPROOT" in os.environ
+    if chosen or not os.access(MEMORY, os.W_OK) or psutil.virtual_memory().available < 12 * 2**30:
+        return
+    if shutil.disk_usage(MEMORY).free > 8 * 2**30:
+        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(MEMORY)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
