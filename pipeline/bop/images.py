@@ -10,6 +10,7 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Bool, Float32, UInt8
 
+from pipeline.bop.pixels import MAX_MEGAPIXELS, check_megapixels, scale_to_8_bits, select_object
 from pipeline.errors import BadInput
 from pipeline.io.digests import unchanged_files
 from pipeline.io.files import IMAGE_FORMATS, read_file
@@ -18,36 +19,44 @@ from pipeline.io.files import IMAGE_FORMATS, read_file
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """8-bit rgb, rotated upright by its EXIF orientation.
 
-    Grey images become three equal channels; 16-bit grey is scaled so that 65535 becomes 255; alpha is dropped.
+    Grey images become three equal channels; more than 8 bits are scaled by bop.pixels; alpha is dropped.
     """
     with _open(path) as image:
-        if image.mode.startswith("I"):
-            grey = np.round(np.asarray(image, dtype=np.float64) / 257).clip(0, 255).astype(np.uint8)
-            return np.repeat(grey[..., None], 3, axis=-1)
+        if image.mode[0] in "IF":
+            return np.repeat(scale_to_8_bits(np.asarray(image), path)[..., None], 3, axis=-1)
         return np.asarray(image.convert("RGB")).copy()
 
 
-def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """True where the image is not black, or where it is opaque if the mask is drawn in the alpha channel only."""
+def read_mask(path: Path, *, label: int | None = None) -> Bool[np.ndarray, "H W"]:
+    """The pixels of the object: not black, or opaque if the mask is drawn in the alpha channel only.
+
+    ``label``: the value to select in an image of labels. bop.pixels has the rules for soft edges and compression.
+    """
     with _open(path) as image:
+        if label is not None and image.mode == "P":
+            return select_object(np.asarray(image), path, label=label)  # labels are indices of the palette
         values = np.asarray(image.convert("RGBA") if image.mode in ("P", "PA", "LA", "RGBA") else image)
-    values = values.reshape(*values.shape[:2], -1)
-    if values.shape[-1] != 4:
-        return np.asarray(values.any(axis=-1))
-    colour, alpha = values[..., :3].any(axis=-1), values[..., 3] > 0
-    drawn_in_alpha = not alpha.all() and (colour.all() or not colour.any())
-    return np.asarray(alpha if drawn_in_alpha else colour & alpha)
+    if values.ndim == 2 or values.shape[-1] != 4:
+        return select_object(values, path, label=label)
+    colour, alpha = values[..., :3].any(axis=-1), values[..., 3]
+    if not (alpha > 0).all() and (colour.all() or not colour.any()):
+        return select_object(alpha, path, label=label)
+    return select_object(np.where(alpha[..., None] > 0, values[..., :3], 0), path, label=label)
 
 
 def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
     """Depth in mm along the optical axis, 0 where unknown: file values times ``depth_scale``."""
     with _open(path) as image:
+        if image.mode in ("P", "1"):
+            found = "a palette" if image.mode == "P" else "one bit a pixel"
+            raise BadInput(path, found=found, needed="a depth image with one number a pixel")
         values = np.asarray(image, dtype=np.float64)
     if values.ndim != 2:
         raise BadInput(path, found=f"{values.shape[-1]} channels", needed="a depth image with one channel")
     return (values * depth_scale).astype(np.float32)
 
 
+PIL.Image.MAX_IMAGE_PIXELS = MAX_MEGAPIXELS * 10**6  # PIL's own limit of 179 would call a large photograph an attack
 _ORIENTATION_TAG = 0x0112
 _UPRIGHT = {
     2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
@@ -83,7 +92,9 @@ def read_orientation(path: Path) -> int:
 def _open_header(path: Path) -> PIL.Image.Image:
     if path.exists() and not path.is_file():
         raise OSError("not a regular file")
-    return PIL.Image.open(path, formats=IMAGE_FORMATS)
+    image = PIL.Image.open(path, formats=IMAGE_FORMATS)
+    check_megapixels(image.width, image.height, path)
+    return image
 
 
 def _open(path: Path) -> PIL.Image.Image:

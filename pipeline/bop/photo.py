@@ -18,7 +18,7 @@ from pipeline.functional.camera_diagnosis import denormalize_camera
 from pipeline.io.meshes import diameter_mm, read_mesh
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.spec import PositiveFloat, Spec, digest, spec
+from pipeline.spec import Positive, PositiveFloat, Spec, digest, spec
 
 SCENE_ID, IM_ID = 0, 0
 _MIN_DIAMETER_MM = 2.0
@@ -29,8 +29,8 @@ class PhotoConfig(Spec):
     """A mesh, a photograph, K, and the object's location: a mask, a box, or neither if a detector is to find it.
 
     ``mesh``: one file, or several for a detector; they become objects 1, 2, ... in this order. ``K``: fx, fy, cx, cy
-    or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height in pixels. ``scale`` multiplies the
-    mesh's vertices: 1000 for a mesh in metres.
+    or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height in pixels. ``mask_label``: the
+    object's value in a mask that labels several. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -39,6 +39,7 @@ class PhotoConfig(Spec):
     image: str
     K: tuple[Any, ...]
     mask: str | None = None
+    mask_label: Positive | None = None
     bbox: tuple[float, float, float, float] | None = None
     scale: PositiveFloat = 1.0
     name: str = "photo"
@@ -75,6 +76,7 @@ class PhotoConfig(Spec):
             photo_path=image,
             mesh_paths=tuple(Path(mesh).expanduser() for mesh in meshes),
             camera_matrix=K,
+            mask_label=self.mask_label,
             mask_file=None if self.mask is None else Path(self.mask).expanduser(),
             bbox_xyxy=None if self.bbox is None else xyxy_from_xywh(self.bbox),
             scale=self.scale,
@@ -113,6 +115,7 @@ class Photo(Dataset):
     mesh_paths: tuple[Path, ...] = ()
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     mask_file: Path | None = None
+    mask_label: int | None = None
     bbox_xyxy: Box | None = None
     scale: float = 1.0
 

@@ -55,7 +55,7 @@ def _read_detection(photo: Photo, target: Target) -> Detection:
             needed = f"x, y, width, height of a box inside the image of {w} x {h}"
             raise BadInput("dataset.bbox", found=[x0 + 0.5, y0 + 0.5, x1 - x0, y1 - y0], needed=needed)
         return Detection(*ids, 1.0, 0.0, (x0, y0, x1, y1))
-    mask = read_mask(photo.mask_file)
+    mask = read_mask(photo.mask_file, label=photo.mask_label)
     if mask.shape != (h, w):
         found = f"{mask.shape[1]} x {mask.shape[0]} pixels"
         raise BadInput(photo.mask_file, found=found, needed=f"those of the photograph, {w} x {h} (width x height)")
