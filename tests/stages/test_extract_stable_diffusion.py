@@ -188,7 +188,7 @@ def test_without_noise_the_latent_is_clean_and_the_timestep_still_matters(sd1: P
     spec = extractor(sd1, noise="none", timestep=261)
     backbone = spec.load(CPU)
     with torch.no_grad():
-        latent = backbone._latent(crops.rgb)
+        latent = backbone._encode(crops.rgb)
         expected = read_decoder_maps(backbone.model.unet, latent, 261, backbone.model.prompt, layers=layers, hook="pre")
     assert_close(backbone(crops, layers)[8], expected[8])
     at_zero = features(sd1, crops, layers, noise="none", timestep=0)[8]

@@ -49,8 +49,8 @@ class DiffusersFolder:
     @property
     def files(self) -> dict[str, Path]:
         """Configs and weights that are read, and all files of the tokenizer: transformers decides which it reads."""
-        paths = [self._json(part) for part in _STEMS]
-        paths += [path for part in _STEMS for path in self._tensors(part)]
+        paths = [self._config_path(part) for part in _STEMS]
+        paths += [path for part in _STEMS for path in self._list_tensors(part)]
         paths += [self.root / "scheduler" / "scheduler_config.json"]
         paths += [self.root / "tokenizer" / name for name in _TOKENIZER_FILES]
         paths += [path for path in (self.root / "tokenizer").glob("[!.]*") if path.is_file()]
@@ -62,11 +62,11 @@ class DiffusersFolder:
             raise BadInput(
                 self.root / "text_encoder_2", found="a second text encoder", needed="Stable Diffusion 1.x or 2.x"
             )
-        unet, vae = self._config("unet"), self._config("vae")
-        check_unet(unet, self._json("unet"))
-        check_class(vae, "AutoencoderKL", self._json("vae"))
-        check_fields(vae, ("block_out_channels",), self._json("vae"))
-        check_latents(unet, vae, self._json("unet"))
+        unet, vae = self._read_config("unet"), self._read_config("vae")
+        check_unet(unet, self._config_path("unet"))
+        check_class(vae, "AutoencoderKL", self._config_path("vae"))
+        check_fields(vae, ("block_out_channels",), self._config_path("vae"))
+        check_latents(unet, vae, self._config_path("unet"))
         scheduler = self.root / "scheduler" / "scheduler_config.json"
         return DiffusionConfigs(
             unet, vae, alphas_cumprod(read_json(scheduler) if file_exists(scheduler) else {}, scheduler)
@@ -76,26 +76,26 @@ class DiffusersFolder:
         """See Weights."""
         from diffusers import UNet2DConditionModel
 
-        return self._fill(self._empty(UNet2DConditionModel, "unet", dtype), "unet")
+        return self._fill(self._allocate(UNet2DConditionModel, "unet", dtype), "unet")
 
     def load_vae(self, dtype: torch.dtype) -> nn.Module:
         """See Weights."""
         from diffusers import AutoencoderKL
 
-        return self._fill(drop_decoder(self._empty(AutoencoderKL, "vae", dtype)), "vae")
+        return self._fill(drop_decoder(self._allocate(AutoencoderKL, "vae", dtype)), "vae")
 
     def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
         """See Weights."""
-        config, width = self._config("text_encoder"), self._config("unet")["cross_attention_dim"]
+        config, width = self._read_config("text_encoder"), self._read_config("unet")["cross_attention_dim"]
         if config.get("hidden_size") != width:
             found = f"hidden_size {config.get('hidden_size')}"
-            raise BadInput(self._json("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
-        ids = self._token_ids(text, config)
-        outer, inner = build_text_encoder(config, self._json("text_encoder"))
+            raise BadInput(self._config_path("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
+        ids = self._tokenize(text, config)
+        outer, inner = build_text_encoder(config, self._config_path("text_encoder"))
         self._fill(inner, "text_encoder")
         return encode_text(outer, ids)
 
-    def _token_ids(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
+    def _tokenize(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
         folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
         if not any(file_exists(folder / name) for name in ("vocab.json", "tokenizer.json")):
             return tokenize_empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
@@ -112,18 +112,18 @@ class DiffusersFolder:
             )
         return torch.tensor([ids])
 
-    def _json(self, part: str) -> Path:
+    def _config_path(self, part: str) -> Path:
         return self.root / part / "config.json"
 
-    def _config(self, part: str) -> dict[str, Any]:
-        path = self._json(part)
+    def _read_config(self, part: str) -> dict[str, Any]:
+        path = self._config_path(part)
         if not path.exists():
             seen = sorted(p.parent.name for p in self.root.glob("*/config.json"))
             needed = "a Stable Diffusion 1.x or 2.x folder with unet, vae and text_encoder"
             raise BadInput(path, found=f"no such file (configs of: {', '.join(seen) or 'nothing'})", needed=needed)
         return read_json(path)
 
-    def _tensors(self, part: str) -> list[Path]:
+    def _list_tensors(self, part: str) -> list[Path]:
         """Weight files of a part: one, or an index and its shards; full precision is preferred to half."""
         folder, stem = self.root / part, _STEMS[part]
         for variant in ("", ".fp16"):
@@ -137,11 +137,11 @@ class DiffusersFolder:
         needed = "safetensors: convert it (save_pretrained, safe_serialization=True)" if pickled else "the weights"
         raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
 
-    def _empty(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
-        return allocate_model(cls, self._config(part), dtype, self._json(part))
+    def _allocate(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
+        return allocate_model(cls, self._read_config(part), dtype, self._config_path(part))
 
     def _fill(self, model: nn.Module, part: str) -> nn.Module:
-        load_weights(model, [path for path in self._tensors(part) if path.suffix == ".safetensors"])
+        load_weights(model, [path for path in self._list_tensors(part) if path.suffix == ".safetensors"])
         return model
 
 

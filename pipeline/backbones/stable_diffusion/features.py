@@ -129,28 +129,30 @@ class DiffusionBackbone:
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers in the spec's dtype, on the model's device, computed ``batch`` crops at a time."""
         _check(self.spec, self.configs, layers)
-        chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
+        chunks = [self._extract_chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
         # outside inference mode, so that the result is an ordinary tensor that may be changed in place
         return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
 
     @torch.inference_mode()
-    def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+    def _extract_chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         with use_deterministic_convolutions():
-            latent = self._latent(crops.rgb)
+            latent = self._encode(crops.rgb)
             members = 1 if self.spec.noise == "none" else self.spec.ensemble
-            return _average([self._maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
+            return _average([self._extract_maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
 
-    def _latent(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n c h w"]:
+    def _encode(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n c h w"]:
         # one by one on the CPU: a batch is no faster there, and the VAE's first maps are the largest of all
         step = 1 if self.model.prompt.device.type == "cpu" else len(rgb)
-        images = [self._image(rgb[i : i + step]) for i in range(0, len(rgb), step)]
+        images = [self._prepare_image(rgb[i : i + step]) for i in range(0, len(rgb), step)]
         return torch.cat([encode_latent(self.model.vae, self.configs.vae, image) for image in images])
 
-    def _image(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n 3 H W"]:
+    def _prepare_image(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n 3 H W"]:
         image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self.model.prompt.device)
         return to_network_image(image, size=self.spec.input_size).to(self.model.prompt.dtype)
 
-    def _maps(self, crops: Crops, latent: Float[Tensor, "n c h w"], seed: int, layers: Sequence[int]) -> FeatureMaps:
+    def _extract_maps(
+        self, crops: Crops, latent: Float[Tensor, "n c h w"], seed: int, layers: Sequence[int]
+    ) -> FeatureMaps:
         s = self.spec
         if s.noise != "none":
             shape = (latent.shape[1], latent.shape[2], latent.shape[3])

@@ -95,13 +95,13 @@ class SingleFile:
 
         config = self.read_configs().vae
         model = drop_decoder(allocate_model(AutoencoderKL, config, dtype, self.path))
-        return self._fill(model, convert_ldm_vae_checkpoint(self._tensors(_VAE), dict(config)))
+        return self._fill(model, convert_ldm_vae_checkpoint(self._read_tensors(_VAE), dict(config)))
 
     def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
         """See Weights. Such a file has no tokenizer, so only the empty text is possible."""
         is_open = any(name.startswith(_OPEN_CLIP) for name in self.shapes)
         prefix = _OPEN_CLIP if is_open else _CLIP
-        state = {name.removeprefix(prefix): tensor for name, tensor in self._tensors(prefix).items()}
+        state = {name.removeprefix(prefix): tensor for name, tensor in self._read_tensors(prefix).items()}
         try:
             state = convert_open_clip(state) if is_open else _strip_wrapper(state)
             config = text_config({name: tuple(t.shape) for name, t in state.items()}, open_clip=is_open)
@@ -121,7 +121,7 @@ class SingleFile:
         check_missing(sorted(missing), self.path)
         return model
 
-    def _tensors(self, prefix: str) -> dict[str, Tensor]:
+    def _read_tensors(self, prefix: str) -> dict[str, Tensor]:
         from safetensors import safe_open
 
         with safe_open(str(self.path), framework="pt") as tensors:

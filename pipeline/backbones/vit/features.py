@@ -136,26 +136,26 @@ class VitBackbone:
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers in the spec's dtype, on the model's device, computed ``batch`` crops at a time."""
         _check(self.spec, layers)
-        chunks = [self._chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
+        chunks = [self._extract_chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
         # outside inference mode, so that the result is an ordinary tensor that may be changed in place
         return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
 
     @torch.inference_mode()
-    def _chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+    def _extract_chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         s = self.spec
         with use_deterministic_convolutions():
             found = read_block_tokens(
                 self.model,
-                embed_patches(self.model, self._image(crops), stride=s.stride_px),
+                embed_patches(self.model, self._prepare_image(crops), stride=s.stride_px),
                 layers=layers,
                 facet=s.facet,
                 norm_last=s.norm_last,
                 saliency_heads=_heads(s),
                 skipped=1 + s.sizes.registers,
             )
-            return {layer: self._map(tokens, layer) for layer, tokens in found.items()}
+            return {layer: self._to_map(tokens, layer) for layer, tokens in found.items()}
 
-    def _image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
+    def _prepare_image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
         """The image that patches are cut from: the crops at ``input_size``, padded and standardised."""
         s = self.spec
         rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
@@ -163,7 +163,7 @@ class VitBackbone:
         padded = pad_border(image, overhang=s.sizes.patch - s.stride_px)
         return standardise(padded).to(getattr(torch, s.dtype))
 
-    def _map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
+    def _to_map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
         side = 1 if layer == CLASS_TOKEN_LAYER else self.spec.input_size // self.spec.stride_px
         maps = tokens.transpose(1, 2).unflatten(2, (side, side))
         return log_bin(maps, hierarchy=self.spec.hierarchy) if layer in self.spec.binned else maps

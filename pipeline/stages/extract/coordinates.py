@@ -69,9 +69,9 @@ class CoordinatesBackbone:
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32. Raises BadInput for crops without geometry."""
         views = [cell_points(crops, i, cells=FINEST) for i in range(len(crops))]
-        return {layer: torch.from_numpy(self._maps(views, layer)).to(self.device) for layer in layers}
+        return {layer: torch.from_numpy(self._compute_maps(views, layer)).to(self.device) for layer in layers}
 
-    def _maps(
+    def _compute_maps(
         self, views: Sequence[tuple[Float[np.ndarray, "hw 3"], Bool[np.ndarray, " hw"]]], layer: int
     ) -> Float32[np.ndarray, "n c h w"]:
         draws = np.random.default_rng([self.spec.seed, layer]).standard_normal((3, self.spec.channels // 2))

@@ -122,11 +122,11 @@ class EmbeddedBackbone(DiffusionBackbone):
         decoder_layers = _decoder_layers(layers)
         maps = super().__call__(crops, decoder_layers) if decoder_layers else {}
         if EDGES in layers:
-            chunks = [self._edges(crops[i : i + self.batch]) for i in range(0, len(crops), self.batch)]
+            chunks = [self._compute_edges(crops[i : i + self.batch]) for i in range(0, len(crops), self.batch)]
             maps = {**maps, EDGES: torch.cat(chunks)}
         return maps
 
-    def _edges(self, crops: Crops) -> Float[Tensor, "n 8 h w"]:
+    def _compute_edges(self, crops: Crops) -> Float[Tensor, "n 8 h w"]:
         device = self.model.prompt.device
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (crops.rgb, crops.mask))
         edges = edge_histograms(rgb, mask, cells=self.spec.feature_shape(EDGES)[1])

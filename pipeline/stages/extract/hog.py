@@ -76,9 +76,9 @@ class HogBackbone:
         energy = oriented_energy(rgb, mask, orientations=s.orientations, signed=s.signed, silhouette=s.silhouette)
         # always through the finest cells, so that a layer has the same bytes whichever other layers are requested
         finest = cell_means(energy, cells=max(CELLS.values()))
-        return {k: self._map(cell_means(finest, cells=n)) for k, n in cells.items()}
+        return {k: self._compute_map(cell_means(finest, cells=n)) for k, n in cells.items()}
 
-    def _map(self, histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n c h w"]:
+    def _compute_map(self, histograms: Float[Tensor, "n o h w"]) -> Float[Tensor, "n c h w"]:
         return append_neighbours(
             smooth_histograms(histograms), distance=self.spec.context_cells, contrast=self.spec.contrast
         )
