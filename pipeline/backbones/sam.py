@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.backbones.pretrained import load_pretrained
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import fetch_snapshot, is_local, read_json, sweep_hint
+from pipeline.io.checkpoints import fetch_snapshot, is_local, read_json, resolve_hub_cache, sweep_hint
 from pipeline.io.digests import file_exists
 
 FIELD = "detect.proposals.weights"
@@ -50,6 +50,8 @@ def open_sam_weights(weights: str, revision: str | None) -> SamWeights:
     elif not path.exists():
         needed = "a folder of SamModel or Sam2Model" + sweep_hint(_NAME)
         raise BadInput(FIELD, found=f"{weights!r}, which does not exist", needed=needed)
+    else:
+        path = resolve_hub_cache(path, FIELD)
     config = path / "config.json"
     model_type = read_json(config).get("model_type")
     if model_type not in CLASSES:

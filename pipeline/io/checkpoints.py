@@ -13,6 +13,19 @@ from pipeline.errors import BadInput
 from pipeline.io.files import read_file
 
 PICKLES = (".bin", ".ckpt", ".pt", ".pth")
+_OTHER_CONTENT = {
+    b"version https://git-lfs": "a git-lfs pointer instead of the file: run `git lfs pull`, or download it again",
+    b"<!doctype html": "a web page instead of the file: download it again, with a token if the model is gated",
+    b"<html": "a web page instead of the file: download it again, with a token if the model is gated",
+    b"entry not found": "a hub's error message instead of the file: download it again",
+    b"access to model": "a hub's error message instead of the file: the model is gated, download it with a token",
+    b"invalid username": "a hub's error message instead of the file: download it again",
+    b'{"error"': "a hub's error message instead of the file: download it again",
+    b"gguf": "a GGUF file, which holds quantised weights",
+    b"pk\x03\x04": "a zip archive or pickled weights, which are never loaded",
+    b"\x80\x02": "pickled weights, which are never loaded",
+}
+"""Beginnings (lower case) of files that are often mistaken for weights."""
 _offline: ContextVar[bool] = ContextVar("offline", default=False)
 
 
@@ -77,7 +90,11 @@ def list_shards(index: Path) -> list[Path]:
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict) or not weight_map:
         raise BadInput(index, found=f"weight_map {weight_map!r}", needed="the file of each tensor")
-    return sorted({index.parent / str(name) for name in weight_map.values()})
+    names = sorted({str(name) for name in weight_map.values()})
+    for name in names:
+        if name != Path(name).name or name in ("", ".", ".."):
+            raise BadInput(index, found=f"a shard named {name[:80]!r}", needed="file names in the index's folder")
+    return [index.parent / name for name in names]
 
 
 def list_pickles(folder: Path) -> list[str]:
@@ -93,7 +110,37 @@ def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
         with safe_open(str(path), framework="pt") as tensors:
             return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise BadInput(path, found=first_line(error), needed="a complete safetensors file") from None
+        found = describe_other_content(path) or first_line(error)
+        raise BadInput(path, found=found, needed="a complete safetensors file") from None
+
+
+def describe_other_content(path: Path) -> str:
+    """What a file holds in place of weights or a config, such as a git-lfs pointer; "" for no known mix-up."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(512)
+    except OSError:
+        return ""
+    text = head.lstrip().lower()
+    for beginning, content in _OTHER_CONTENT.items():
+        if text.startswith(beginning):
+            return content
+    return "an empty file" if not head else ""
+
+
+def resolve_hub_cache(folder: Path, field: str) -> Path:
+    """The folder, or the snapshot inside it where it is a model's folder in the hub's cache (refs, blobs, snapshots).
+
+    Raises BadInput, naming the snapshots, where there is not exactly one.
+    """
+    if not ((folder / "snapshots").is_dir() and ((folder / "blobs").is_dir() or (folder / "refs").is_dir())):
+        return folder
+    snapshots = sorted(path for path in (folder / "snapshots").iterdir() if path.is_dir())
+    if len(snapshots) == 1:
+        return snapshots[0]
+    names = ", ".join(path.name for path in snapshots) or "none"
+    found = f"{str(folder)!r}, a model's folder in the hub's cache with {len(snapshots)} snapshots"
+    raise BadInput(field, found=found, needed=f"one of its folders snapshots/<commit>: {names}")
 
 
 def check_missing(names: Sequence[str], where: Path) -> None:
@@ -107,7 +154,8 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(read_file(path, "valid JSON"))
     except (ValueError, RecursionError) as error:
-        raise BadInput(path, found=first_line(error), needed="valid JSON") from None
+        found = describe_other_content(path) or first_line(error)
+        raise BadInput(path, found=found, needed="valid JSON") from None
     if not isinstance(value, dict):
         raise BadInput(path, found=type(value).__name__, needed="a JSON object")
     return value

@@ -399,7 +399,7 @@ def test_weights_that_are_truncated_or_do_not_fit_are_named(tmp_path: Path) -> N
     assert "tensor layers.0" in (message := refusal(folder)) or "tensor encoder.layer.0" in message
     assert "found (96,), needs (200,), as config.json says" in message
     edit(folder, patch_size=[8, 8])
-    assert "config.json: found patch_size [8, 8], needs a whole number, 1 or more" in refusal(folder)
+    assert "config.json: found patch_size [8, 8], needs a whole number from 1 to 16384" in refusal(folder)
     edit(folder, hidden_size="wide")
     assert "config.json: found" in refusal(folder)
     (folder / "config.json").write_text("{")

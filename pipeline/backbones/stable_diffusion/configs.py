@@ -12,6 +12,7 @@ from jaxtyping import Float
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import first_line
 
+MAX_LAYERS, MAX_LEVELS = 16, 8  # of a U-Net; Stable Diffusion has 2 and 4
 _SCHEDULE = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 _SCHEDULE_FIELDS = (*_SCHEDULE, "trained_betas", "rescale_betas_zero_snr")
 
@@ -28,6 +29,10 @@ def check_unet(config: Mapping[str, Any], where: Path) -> None:
     for name in ("layers_per_block", "cross_attention_dim"):
         if not isinstance(config[name], int):
             raise BadInput(where, found=f"{name} {config[name]!r}", needed="one whole number")
+    blocks, levels = config["layers_per_block"], config["block_out_channels"]
+    if not (1 <= blocks <= MAX_LAYERS and isinstance(levels, list) and len(levels) <= MAX_LEVELS):
+        found = f"layers_per_block {blocks}, {len(levels) if isinstance(levels, list) else levels} levels"
+        raise BadInput(where, found=found, needed=f"at most {MAX_LAYERS} layers a block and {MAX_LEVELS} levels")
     if unknown := sorted(set(config.get("up_block_types", ())) - {"UpBlock2D", "CrossAttnUpBlock2D"}):
         raise BadInput(where, found=f"up_block_types {unknown[0]!r}", needed="UpBlock2D or CrossAttnUpBlock2D")
 

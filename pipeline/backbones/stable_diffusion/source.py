@@ -13,7 +13,7 @@ from pipeline.backbones.stable_diffusion.diffusers_folder import FIELD, NAME, Di
 from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
 from pipeline.backbones.stable_diffusion.single_file import SingleFile
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import is_local, sweep_hint
+from pipeline.io.checkpoints import is_local, resolve_hub_cache, sweep_hint
 
 
 class Weights(Protocol):
@@ -50,7 +50,7 @@ def open_weights(weights: str, revision: str | None) -> Weights:
         needed = "a diffusers folder or a .safetensors file" + sweep_hint(NAME)
         raise BadInput(FIELD, found=f"{weights!r}, which does not exist", needed=needed)
     if path.is_dir():
-        return DiffusersFolder(path)
+        return DiffusersFolder(resolve_hub_cache(path, FIELD))
     if path.suffix != ".safetensors":
         raise BadInput(FIELD, found=f"{weights!r}", needed="safetensors: convert it, pickled weights are never opened")
     return SingleFile(path)

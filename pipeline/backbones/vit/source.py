@@ -11,10 +11,19 @@ from torch import nn
 
 from pipeline.backbones.pretrained import full_text, load_pretrained, silence_libraries
 from pipeline.errors import BadInput
-from pipeline.io.checkpoints import fetch_snapshot, is_local, list_pickles, list_shards, read_json, sweep_hint
+from pipeline.io.checkpoints import (
+    fetch_snapshot,
+    is_local,
+    list_pickles,
+    list_shards,
+    read_json,
+    resolve_hub_cache,
+    sweep_hint,
+)
 from pipeline.io.digests import file_exists
 
 FIELD = "extract.weights"
+MAX_SIZE = 16384  # of width, depth, heads, patch and image; a larger number is a mistake
 CLASSES = {
     "vit": "ViTModel",
     "dinov2": "Dinov2Model",
@@ -46,7 +55,7 @@ def open_folder(weights: str, revision: str | None, model_types: tuple[str, ...]
         found = f"{weights!r}, which is {'a file' if path.exists() else 'not there'}"
         needed = "a folder as save_pretrained writes it, or a hub id" + sweep_hint(name)
         raise BadInput(FIELD, found=found, needed=needed)
-    return TransformersFolder(path, model_types)
+    return TransformersFolder(resolve_hub_cache(path, FIELD), model_types)
 
 
 @dataclass(frozen=True)
@@ -67,8 +76,8 @@ class TransformersFolder:
         registers = getattr(config, "num_register_tokens", 0)
         for name in ("hidden_size", "num_hidden_layers", "num_attention_heads", "patch_size", "image_size"):
             size = getattr(config, name)
-            if not isinstance(size, int) or size < 1:
-                raise BadInput(self._json, found=f"{name} {size!r}", needed="a whole number, 1 or more")
+            if not isinstance(size, int) or not 1 <= size <= MAX_SIZE:
+                raise BadInput(self._json, found=f"{name} {size!r}", needed=f"a whole number from 1 to {MAX_SIZE}")
         return VitSizes(
             config.hidden_size, config.num_hidden_layers, config.num_attention_heads, config.patch_size, registers
         )
