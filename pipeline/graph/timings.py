@@ -10,12 +10,15 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import inf
 from pathlib import Path
 
 import torch
 
+from pipeline.errors import DzopError
 from pipeline.io.files import write_json
 from pipeline.method import ONLINE_STAGES, Stages
 from pipeline.spec import digest
@@ -46,10 +49,8 @@ class Timings:
         """Write this run's measurements. They replace older ones of the same key: the machine may have changed."""
         if self.folder is None or not self.measured:
             return
-        try:
+        with suppress(DzopError):  # a read-only or full disk, or a file in the folder's place
             write_json(self._path, self._read() | self.measured)
-        except OSError:
-            return
 
     @property
     def _path(self) -> Path:
@@ -67,9 +68,17 @@ class Timings:
             return {}
         try:
             saved = json.loads(self._path.read_text())
-            return {str(key): [float(rows), float(seconds)] for key, (rows, seconds) in saved.items() if rows > 0}
-        except (OSError, ValueError, TypeError, AttributeError):
+            return {
+                key: [float(rows), float(seconds)]
+                for key, (rows, seconds) in saved.items()
+                if _is_usable(rows, seconds)
+            }
+        except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError):
             return {}
+
+
+def _is_usable(rows: float, seconds: float) -> bool:
+    return 0 < rows < inf and 0 < seconds < inf
 
 
 def timing_key(step: str, stages: Stages, layers: Sequence[int] = (), rows: int = 0) -> str:
