@@ -235,16 +235,21 @@ def _worker_setup(run: Context, runtime: RayRuntime, threads: int) -> dict[str, 
         "threads": threads or runtime.cpus_per_actor,
         "folder": os.getcwd(),
         "digests": tracked_digests(),
+        "lease": run.store.lease.name if run.store.lease else "",
     }
 
 
-def _build_graph(run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str, digests: dict[str, str]) -> Graph:
+def _build_graph(
+    run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str, digests: dict[str, str], lease: str
+) -> Graph:
     if os.path.isdir(folder):
         os.chdir(folder)  # paths in the configuration may be relative
     track_files(known=digests).__enter__()  # as long as this process lives: a worker serves one run
     use_threads(threads)
-    stages, dataset, targets, store = run
-    graph = Graph(Context(stages, dataset, targets, Store(store), runtime))
+    stages, dataset, targets, config = run
+    store = Store(config)
+    store.join_lease(lease)
+    graph = Graph(Context(stages, dataset, targets, store, runtime))
     graph.check()
     graph.limit_vram()
     return graph

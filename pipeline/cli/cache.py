@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.errors import DzopError
 from pipeline.progress import format_bytes
 from pipeline.store import LocalStoreConfig, S3StoreConfig, Store
-from pipeline.store.admin import EntryInfo, collect_garbage, find_entry, list_entries, verify
+from pipeline.store.admin import EntryInfo, check_is_store, collect_garbage, find_entry, list_entries, verify
 
 
 def cache_command(arguments: list[str]) -> None:
@@ -56,20 +56,19 @@ def _days(text: str) -> float:
 
 
 def _open(root: str) -> Store:
-    if root.startswith("s3://"):
-        return Store(S3StoreConfig(url=root), announce=print)
-    if not Path(root).is_dir():
+    if not root.startswith("s3://") and not Path(root).is_dir():
         raise DzopError(f"{root}: found no such folder, needs a store (--root)")
-    if not (Path(root) / ".locks").is_dir() and any(p.name != ".gitkeep" for p in Path(root).iterdir()):
-        raise DzopError(f"{root}: found a folder that is not a store, needs one that a run has written (--root)")
-    return Store(LocalStoreConfig(root=root), announce=print)
+    config = S3StoreConfig(url=root) if root.startswith("s3://") else LocalStoreConfig(root=root)
+    store = Store(config, announce=print)
+    check_is_store(store)
+    return store
 
 
 def _print_entries(entries: list[EntryInfo], *, long: bool) -> None:
     print(f"{'state':<11}{'rows':>6}{'size':>10}{'age':>8}  path")
     for entry in entries:
         size, age = format_bytes(entry.stored_bytes), _format_age(entry.age_h)
-        print(f"{_state(entry):<11}{entry.rows:>6}{size:>10}{age:>8}  {entry.path}")
+        print(f"{entry.state:<11}{entry.rows:>6}{size:>10}{age:>8}  {entry.path}")
         if long:
             print(f"{'':37}made from {json.dumps(entry.made_from, sort_keys=True)}")
 
@@ -78,10 +77,6 @@ def _format_age(hours: float | None) -> str:
     if hours is None:
         return "-"
     return f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
-
-
-def _state(entry: EntryInfo) -> str:
-    return "complete" if entry.complete else "incomplete"
 
 
 def _print_sizes(entries: list[EntryInfo]) -> None:
@@ -113,5 +108,5 @@ def _collect_garbage(store: Store, older_than_days: float | None, *, dry_run: bo
     removed = collect_garbage(store, older_than_h=hours, dry_run=dry_run)
     for entry in removed:
         verb = "would remove" if dry_run else "removed"
-        print(f"{verb} {entry.path} ({format_bytes(entry.stored_bytes)}, {_state(entry)})")
+        print(f"{verb} {entry.path} ({format_bytes(entry.stored_bytes)}, {entry.state})")
     print(f"{len(removed)} entries, {format_bytes(sum(entry.stored_bytes for entry in removed))}")

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from pipeline.errors import BadInput
-from pipeline.store.completion import completion_record
-from pipeline.store.entry import DamagedEntry
+from pipeline.errors import BadInput, DzopError
+from pipeline.store.arrays import delete_keys, list_keys, read_bytes, write_attributes
+from pipeline.store.completion import completion_record, is_newer
+from pipeline.store.entry import DamagedEntry, withdraw
 from pipeline.store.keys import Ref, make_ref
+from pipeline.store.leases import live_leases, remove_expired_leases
 from pipeline.store.store import Store
+from pipeline.store.writing import MARKER
+
+COMPLETE, INCOMPLETE, NEWER, FOREIGN = "complete", "incomplete", "newer", "foreign"
+"""States of an entry. Newer: of a newer format. Foreign: a folder named like an entry, but without our marker."""
 
 
 @dataclass(frozen=True)
@@ -18,12 +25,17 @@ class EntryInfo:
     """One entry as ``dzop cache ls`` lists it. ``age_h``: hours since it was completed, None if it never was."""
 
     path: str
-    complete: bool
+    state: str
     rows: int
     stored_bytes: int
     age_h: float | None
     kind: str
     made_from: Any
+
+    @property
+    def complete(self) -> bool:
+        """Whether it is complete and in a format that this version reads."""
+        return self.state == COMPLETE
 
     @property
     def folder(self) -> str:
@@ -48,18 +60,26 @@ def list_entries(store: Store) -> list[EntryInfo]:
 
 def _describe(store: Store, path: str) -> EntryInfo:
     attributes = store.attributes(path) or {}
-    record = completion_record(attributes, path.rpartition("/")[2])
+    record = None if is_newer(attributes) else completion_record(attributes, path.rpartition("/")[2])
     made_from = attributes.get("made_from")
     recipe = made_from.get("recipe") if isinstance(made_from, dict) else None
     return EntryInfo(
         path=path,
-        complete=record is not None,
+        state=_state(store, path, attributes, record),
         rows=0 if record is None else int(record["rows"]),
         stored_bytes=store.stored_bytes(path),
         age_h=None if record is None else _hours_since(record["at"]),
         kind=str(recipe.get("kind", "?")) if isinstance(recipe, dict) else "?",
         made_from=made_from,
     )
+
+
+def _state(store: Store, path: str, attributes: Mapping[str, Any], record: Mapping[str, Any] | None) -> str:
+    if record is not None:
+        return COMPLETE
+    if is_newer(attributes):
+        return NEWER
+    return INCOMPLETE if store.is_ours(path) else FOREIGN
 
 
 def _hours_since(time: str) -> float:
@@ -70,9 +90,20 @@ def _hours_since(time: str) -> float:
 def verify(store: Store) -> dict[str, str]:
     """Read every byte of every entry: path -> problem, "" for an intact entry.
 
-    A damaged entry is marked incomplete, so that the next run repairs it.
+    A damaged entry is marked incomplete, so that the next run repairs it. Folders that are not entries are left out,
+    and entries of a newer format, which is announced.
     """
-    return {entry.path: _find_problem(store, entry) for entry in list_entries(store)}
+    return {entry.path: _find_problem(store, entry) for entry in _own_entries(store, "not verified")}
+
+
+def _own_entries(store: Store, consequence: str) -> list[EntryInfo]:
+    """Entries that this version may read and remove; announces the others."""
+    reasons = {NEWER: "is of a newer format; update dzop", FOREIGN: "has no marker of dzop, so it is not an entry"}
+    entries = list_entries(store)
+    for entry in entries:
+        if entry.state in reasons:
+            store.announce(f"{entry.path}: {consequence}: it {reasons[entry.state]}")
+    return [entry for entry in entries if entry.state not in reasons]
 
 
 def _find_problem(store: Store, info: EntryInfo) -> str:
@@ -91,14 +122,56 @@ def _find_problem(store: Store, info: EntryInfo) -> str:
 def collect_garbage(store: Store, *, older_than_h: float | None, dry_run: bool) -> list[EntryInfo]:
     """Remove incomplete entries, and complete ones older than ``older_than_h`` if given; returns them.
 
-    ``dry_run`` removes nothing. Where the store has locks, an entry that is being written is waited for and kept.
+    ``dry_run`` removes nothing. Entries that a running process uses are kept, which is announced, and so are folders
+    without our marker and entries of a newer format. Where the store has locks, an entry that is being written is
+    waited for and kept.
     """
-    garbage = [entry for entry in list_entries(store) if not entry.complete or _is_older(entry, older_than_h)]
-    for entry in [] if dry_run else garbage:
-        with store.backend.lock(entry.key, store.announce):
-            if _describe(store, entry.path).complete == entry.complete:  # not completed while we waited
-                store.delete(entry.path)
+    leases = live_leases(store.backend.zarr)
+    garbage = []
+    for entry in _own_entries(store, "kept"):
+        is_garbage = not entry.complete or _is_older(entry, older_than_h)
+        if entry.key in leases:
+            if is_garbage:
+                store.announce(f"{entry.path}: kept: process {leases[entry.key]} uses it")
+        elif not is_garbage:
+            if not dry_run:
+                _remove_leftovers(store, entry)
+        elif dry_run or _remove(store, entry):
+            garbage.append(entry)
+    if not dry_run:
+        remove_expired_leases(store.backend.zarr)
     return garbage
+
+
+def _remove(store: Store, entry: EntryInfo) -> bool:
+    """Remove an entry unless it was completed, or a process began to use it, since it was listed."""
+    with store.backend.lock(entry.key, store.announce):
+        keys, before = list_keys(store.backend.zarr, entry.path), store.attributes(entry.path)
+        if _describe(store, entry.path).state != entry.state:
+            return False
+        withdraw(store.backend, entry.path)  # whoever takes a lease from now on finds no complete entry
+        if entry.key in live_leases(store.backend.zarr):
+            if before is not None:
+                write_attributes(store.backend.zarr, entry.path, before)
+            store.announce(f"{entry.path}: kept: a process has just begun to use it")
+            return False
+        if store.backend.has_locks:
+            store.delete(entry.path)
+        else:  # only what was there before we looked for leases: a writer may have started since
+            delete_keys(store.backend.zarr, keys)
+        return True
+
+
+def _remove_leftovers(store: Store, entry: EntryInfo) -> None:
+    """Remove what other writers left in a complete entry: folders that its record does not name, and journals."""
+    with store.backend.lock(entry.key, store.announce):
+        keys, attributes = list_keys(store.backend.zarr, entry.path), store.attributes(entry.path) or {}
+        record = completion_record(attributes, entry.key)
+        if record is None or entry.key in live_leases(store.backend.zarr):
+            return
+        used = [f"{record['folder']}/"] if record.get("folder") else [f"{name}/" for name in record["arrays"]]
+        keep = tuple(f"{entry.path}/{name}" for name in (*used, "zarr.json", MARKER))
+        delete_keys(store.backend.zarr, [key for key in keys if not key.startswith(keep)])
 
 
 def _is_older(entry: EntryInfo, hours: float | None) -> bool:
@@ -107,8 +180,22 @@ def _is_older(entry: EntryInfo, hours: float | None) -> bool:
 
 def find_entry(store: Store, prefix: str) -> EntryInfo:
     """The only entry whose key starts with ``prefix``. Raises BadInput for none or several."""
-    found = [path for path in store.entry_paths() if path.rpartition("/")[2].startswith(prefix)]
+    paths = [path for path in store.entry_paths() if path.rpartition("/")[2].startswith(prefix)]
+    found = [path for path in paths if store.is_ours(path)]
     if len(found) != 1:
         found_text = f"{len(found)} entries whose key starts with {prefix!r}"
         raise BadInput("cache path", found=found_text, needed="exactly one")
     return _describe(store, found[0])
+
+
+def check_is_store(store: Store) -> None:
+    """Raise DzopError for a folder or bucket that holds other things than a store.
+
+    A store has our marker in its root; one that only older versions wrote has locks, or entries. What is empty passes.
+    """
+    zarr = store.backend.zarr
+    if read_bytes(zarr, MARKER) is not None or (store.backend.folder and (store.backend.folder / ".locks").is_dir()):
+        return
+    keys = [key for key in list_keys(zarr, "") if not key.startswith(".")]
+    if keys and not any(store.is_ours(path) for path in store.entry_paths()):
+        raise DzopError(f"{store.place}: found a folder that is not a store, needs one that a run has written (--root)")

@@ -6,13 +6,17 @@ Every function takes the Zarr store or group that it works on; none of them know
 from __future__ import annotations
 
 import asyncio
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import zarr
 from zarr.abc.store import Store as ZarrStore
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+from zarr.core.buffer import cpu, default_buffer_prototype
 from zarr.core.sync import sync
 from zarr.errors import BaseZarrError
 from zarr.storage import MemoryStore
@@ -38,28 +42,69 @@ class Layout:
         return rows * int(np.prod(self.row, dtype=np.int64)) * np.dtype(self.dtype).itemsize
 
 
-def open_group(store: ZarrStore, path: str) -> zarr.Group | None:
-    """The group at ``path``, None when it is missing or its metadata cannot be read."""
+def read_bytes(store: ZarrStore, key: str) -> bytes | None:
+    """Value of a key, None when there is no such key."""
+    value = sync(store.get(key, default_buffer_prototype()))
+    return None if value is None else value.to_bytes()
+
+
+def write_bytes(store: ZarrStore, key: str, value: bytes) -> None:
+    """Set the value of a key, atomically."""
+    sync(store.set(key, cpu.Buffer.from_bytes(value)))
+
+
+def read_attributes(store: ZarrStore, paths: Sequence[str]) -> list[dict[str, Any] | None]:
+    """Attributes of groups, read at once; None for a group that is missing or whose metadata cannot be read."""
+
+    async def read_all() -> list[Any]:
+        prototype = default_buffer_prototype()
+        return await asyncio.gather(*(store.get(f"{path}/zarr.json", prototype) for path in paths))
+
+    return [None if value is None else _parse_attributes(value.to_bytes()) for value in sync(read_all())]
+
+
+def write_attributes(store: ZarrStore, path: str, attributes: Mapping[str, Any]) -> None:
+    """Replace the attributes of a group, in one request."""
+    metadata = {"attributes": dict(attributes), "zarr_format": 3, "node_type": "group"}
+    write_bytes(store, f"{path}/zarr.json", json.dumps(metadata, indent=2).encode())
+
+
+def _parse_attributes(text: bytes) -> dict[str, Any] | None:
     try:
-        return zarr.open_group(store, path=path, mode="r+", zarr_format=3)
-    except READ_ERRORS:
+        metadata = json.loads(text)
+        if metadata["node_type"] != "group" or metadata["zarr_format"] != 3:
+            return None
+        return dict(metadata.get("attributes", {}))
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
-def open_array(group: zarr.Group, name: str) -> zarr.Array | None:
-    """An array of a group, None when it is missing or its metadata cannot be read."""
+def open_array(store: ZarrStore, path: str) -> zarr.Array | None:
+    """The array at ``path``, None when it is missing or its metadata cannot be read."""
     try:
-        found = group[name]
+        found = zarr.open_array(store, path=path, mode="r+", zarr_format=3)
     except READ_ERRORS:
         return None
     # write_empty_chunks is not stored in the metadata: a reopened array would skip rows of zeros
-    return found.with_config(_WRITE_ZEROS) if isinstance(found, zarr.Array) else None
+    return found.with_config(_WRITE_ZEROS)
 
 
-def create_array(group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Array:
-    """A new array of ``rows`` rows. Raises ContainsArrayError when there is one already."""
-    return group.create_array(
-        name,
+def create_array(store: ZarrStore, path: str, layout: Layout, rows: int) -> zarr.Array:
+    """A new array of ``rows`` rows; one request, and equal bytes whoever creates it.
+
+    The metadata that Zarr would also write for every group above it is left to the entry's group.
+    """
+    write_bytes(store, f"{path}/zarr.json", _array_metadata(layout, rows)[0])
+    return zarr.open_array(store, path=path, mode="r+", zarr_format=3).with_config(_WRITE_ZEROS)
+
+
+@lru_cache(maxsize=64)
+def _array_metadata(layout: Layout, rows: int) -> tuple[bytes, str]:
+    """Content of a new array's zarr.json, and its digest."""
+    store = MemoryStore()
+    array = zarr.create_array(
+        store,
+        name="array",
         shape=(rows, *layout.row),
         chunks=(1, *layout.row),
         dtype=layout.dtype,
@@ -67,14 +112,17 @@ def create_array(group: zarr.Group, name: str, layout: Layout, rows: int) -> zar
         compressors=([ZstdCodec(level=1)] if layout.compress else []) + [Crc32cCodec()],
         config=_WRITE_ZEROS,
     )
+    return read_bytes(store, "array/zarr.json") or b"", metadata_digest(array)
+
+
+def layout_digest(layout: Layout, rows: int) -> str:
+    """Digest of the metadata of a new array with this layout."""
+    return _array_metadata(layout, rows)[1]
 
 
 def has_layout(array: zarr.Array, layout: Layout, rows: int) -> bool:
     """Whether the array's metadata is exactly that of a new array with this layout."""
-    if array.shape != (rows, *layout.row):
-        return False
-    new = create_array(zarr.open_group(MemoryStore(), mode="w"), "array", layout, rows)
-    return metadata_digest(array) == metadata_digest(new)
+    return array.shape == (rows, *layout.row) and metadata_digest(array) == layout_digest(layout, rows)
 
 
 def list_keys(store: ZarrStore, prefix: str) -> list[str]:
@@ -86,12 +134,27 @@ def list_keys(store: ZarrStore, prefix: str) -> list[str]:
     return sync(collect())
 
 
+def delete_keys(store: ZarrStore, keys: Sequence[str]) -> None:
+    """Remove keys, several at once; what is missing already is no error."""
+
+    async def delete_all() -> None:
+        await asyncio.gather(*(store.delete(key) for key in keys))
+
+    sync(delete_all())
+
+
 def stored_bytes(store: ZarrStore, prefix: str) -> int:
     """Bytes that the keys below ``prefix`` take where they are stored."""
+    keys = list_keys(store, prefix)
+
+    async def size(key: str) -> int:
+        try:
+            return await store.getsize(key)
+        except FileNotFoundError:  # removed since the listing
+            return 0
 
     async def total() -> int:
-        keys = [key async for key in store.list_prefix(prefix + "/")]
-        return sum(await asyncio.gather(*(store.getsize(key) for key in keys)))
+        return sum(await asyncio.gather(*(size(key) for key in keys)))
 
     return sync(total())
 
@@ -102,16 +165,3 @@ def present_rows(store: ZarrStore, array: zarr.Array) -> set[int]:
     tail = (0,) * (array.ndim - 1)
     names = (f"{array.path}/{array.metadata.encode_chunk_key((row, *tail))}" for row in range(array.shape[0]))
     return {row for row, name in enumerate(names) if name in keys}
-
-
-def readable_rows(store: ZarrStore, array: zarr.Array) -> set[int]:
-    """Rows whose chunk exists and passes its checksum."""
-    return {row for row in present_rows(store, array) if _is_readable(array, row)}
-
-
-def _is_readable(array: zarr.Array, row: int) -> bool:
-    try:
-        array[row]
-    except READ_ERRORS:
-        return False
-    return True

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from filelock import FileLock, Timeout
+from zarr.abc.store import ByteRequest
 from zarr.abc.store import Store as ZarrStore
-from zarr.core.buffer import Buffer
+from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
@@ -31,12 +33,16 @@ class Backend:
 
     ``place``: its location, for messages. ``folder``: its folder on disk, None when it is not on this machine.
     ``lock(name, announce)``: a context manager; ``announce`` is called with a message if it has to wait.
+    ``has_locks``: whether ``lock`` keeps other writers out; without, each writer of an entry has a folder of its own.
+    ``is_shared``: whether other processes reach the store.
     """
 
     zarr: ZarrStore
     place: str
     folder: Path | None
     lock: Callable[[str, Announce], AbstractContextManager[None]]
+    has_locks: bool = False
+    is_shared: bool = True
 
 
 class StoreConfig(Protocol):
@@ -66,11 +72,40 @@ class LocalStoreConfig(Spec):
         def lock(key: str, announce: Announce) -> AbstractContextManager[None]:
             return _lock_file(root / ".locks", key, announce)
 
-        return Backend(_LocalStore(root), str(root), root, lock)
+        return Backend(_LocalStore(root), str(root), root, lock, has_locks=True)
 
 
 class _LocalStore(LocalStore):
-    """LocalStore without needless writes: creating a group makes Zarr set the metadata of every group above it."""
+    """LocalStore without needless writes: creating a group makes Zarr set the metadata of every group above it.
+
+    A file that cannot be read, for instance without permission or on a broken disk, raises DzopError.
+    """
+
+    async def get(
+        self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """See ZarrStore.get."""
+        try:
+            return await super().get(key, prototype, byte_range)
+        except OSError as error:
+            raise DzopError(f"{self.root / key}: cannot be read ({error.strerror})") from None
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """See ZarrStore.list_prefix. Folders that another process removes meanwhile are no error."""
+        for folder, _, names in os.walk(self.root / prefix):
+            for name in names:
+                yield (Path(folder) / name).relative_to(self.root).as_posix()
+
+    async def delete_dir(self, prefix: str) -> None:
+        """See ZarrStore.delete_dir. What another process removes or adds meanwhile is no error."""
+        for folder, _, names in os.walk(self.root / prefix, topdown=False):
+            for name in names:
+                (Path(folder) / name).unlink(missing_ok=True)
+            try:
+                Path(folder).rmdir()
+            except OSError as error:
+                if error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST):
+                    raise
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
         """As LocalStore.set_if_not_exists, which writes a temporary file even when the key exists."""
@@ -117,15 +152,16 @@ class MemoryStoreConfig(Spec):
             with locks[key]:
                 yield
 
-        return Backend(MemoryStore(), "memory", None, lock)
+        return Backend(MemoryStore(), "memory", None, lock, has_locks=True, is_shared=False)
 
 
 @spec
 class S3StoreConfig(Spec):
     """An S3-compatible bucket (``pip install dzop[s3]``), so that several machines share one cache.
 
-    There are no locks: two workers that need the same entry both compute it and write the same bytes. ``timeout_s``:
-    how long one request may take; it is sent up to six times, with pauses, before the run fails.
+    There are no locks: two workers that need the same entry both compute it, each into a folder of its own, and the
+    completion record names the folder that counts. ``timeout_s``: how long one request may take; it is sent up to six
+    times, with pauses, before the run fails.
     """
 
     kind: ClassVar[str] = "store.s3"

@@ -1,7 +1,8 @@
 """Completion records: the attribute, written last, that turns a group of arrays into a usable entry.
 
-The record holds digests of the document and of every array's metadata, and a checksum (``seal`` on disk) over itself,
-the key and the recipe. An entry whose record is missing or inconsistent counts as incomplete.
+The record holds digests of the document and of every array's metadata, the checksum of every chunk, the folder below
+the entry that holds the arrays, and a checksum (``seal`` on disk) over itself, the key and the recipe. An entry whose
+record is missing or inconsistent counts as incomplete.
 """
 
 from __future__ import annotations
@@ -9,14 +10,20 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from secrets import token_hex
 from typing import Any
 
 import zarr
 
+from pipeline.errors import DzopError
 from pipeline.spec import digest
 from pipeline.store.keys import Ref
 
 FORMAT = 1
+
+
+class NewerEntry(DzopError):
+    """An entry was written by a newer version. It is neither read nor changed."""
 
 
 def metadata_digest(array: zarr.Array) -> str:
@@ -37,8 +44,13 @@ def complete_attributes(
     rows: int,
     time_s: float,
     nbytes: int,
+    folder: str = "",
+    chunks: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Attributes of a complete entry: its identity, document and completion record. Write them last, in one request."""
+    """Attributes of a complete entry: its identity, document and completion record. Write them last, in one request.
+
+    ``folder``: where its arrays are, relative to the entry. ``chunks``: array name -> checksums of its rows in hex.
+    """
     record = {
         "rows": rows,
         "bytes": nbytes,
@@ -46,6 +58,9 @@ def complete_attributes(
         "at": datetime.now(UTC).isoformat(timespec="seconds"),
         "arrays": {name: metadata_digest(array) for name, array in arrays.items()},
         "document": digest(document),
+        "folder": folder,
+        "chunks": dict(chunks or {}),
+        "writer": token_hex(8),  # so that no two records are equal
     }
     known = identity(ref)
     seal = _checksum(ref.key, known["made_from"], record)
@@ -54,19 +69,70 @@ def complete_attributes(
 
 def completion_record(attributes: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
     """The completion record among an entry's attributes; None unless every digest and the checksum match."""
+    record = intact_record(attributes, "complete", key)
     try:
-        record = dict(attributes["complete"])
-        seal = record.pop("seal")
+        return record if record and digest(attributes["document"]) == record["document"] else None
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def intact_record(attributes: Mapping[str, Any], name: str, key: str) -> Mapping[str, Any] | None:
+    """A record of this entry under an attribute's name, None unless its checksum matches.
+
+    ``damaged`` is the name of a completion record that was withdrawn.
+    """
+    try:
+        record = dict(attributes[name])
         intact = (
-            attributes["key"] == key
+            is_ours(attributes, key)
             and attributes["format"] == FORMAT
-            and seal == _checksum(key, attributes["made_from"], record)
-            and digest(attributes["document"]) == record["document"]
+            and record["seal"] == _checksum(key, attributes["made_from"], _without_seal(record))
             and digest(attributes["made_from"]) == key
         )
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
     return record if intact else None
+
+
+def content_of(record: Mapping[str, Any]) -> Any:
+    """What two completion records of an entry have in common if two processes computed the same arrays.
+
+    Entries of documents alone are read in one request, so any complete one is as good: seconds measured by different
+    processes differ. Before chunks were listed, only the record itself can be compared.
+    """
+    if not record["arrays"]:
+        return "document"
+    names = ("arrays", "chunks", "document") if record.get("chunks") else ("seal",)
+    return [record[name] for name in names]
+
+
+def withdraw_record(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes without the completion record, which is kept as ``damaged``: intact rows can be told by it."""
+    left = {name: value for name, value in attributes.items() if name not in ("complete", "damaged")}
+    return left | ({"damaged": attributes["complete"]} if "complete" in attributes else {})
+
+
+def is_ours(attributes: Mapping[str, Any], key: str) -> bool:
+    """Whether these are the attributes of the entry with this key, complete or not, in this format or a newer one."""
+    known = isinstance(attributes.get("format"), int) and isinstance(attributes.get("made_from"), Mapping)
+    return known and attributes.get("key") == key
+
+
+def check_format(attributes: Mapping[str, Any], where: str) -> None:
+    """Raise NewerEntry for an entry of a newer format."""
+    if is_newer(attributes):
+        found = f"an entry of format {attributes['format']}, needs format {FORMAT}"
+        raise NewerEntry(f"{where}: found {found}: update dzop, or use another store.root")
+
+
+def is_newer(attributes: Mapping[str, Any]) -> bool:
+    """Whether an entry has a newer format than this version writes."""
+    found = attributes.get("format")
+    return isinstance(found, int) and not isinstance(found, bool) and found > FORMAT
+
+
+def _without_seal(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in record.items() if name != "seal"}
 
 
 def _checksum(key: str, made_from: Any, record: Mapping[str, Any]) -> str:

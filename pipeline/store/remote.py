@@ -23,6 +23,10 @@ class StoreUnreachable(DzopError):
     """A remote store did not answer or denied access. This says nothing about which entries it holds."""
 
 
+class AccessDenied(StoreUnreachable):
+    """A remote store denied access."""
+
+
 @contextmanager
 def translate_errors(place: str) -> Iterator[None]:
     """Raise StoreUnreachable, with a one-line message, for timeouts, refusals and lost connections.
@@ -39,7 +43,7 @@ def translate_errors(place: str) -> Iterator[None]:
         raise StoreUnreachable(f"{place}: the bucket does not exist; create it or correct store.url") from None
     except PermissionError as error:
         advice = f"check the AWS credentials, then run again: {_RESUME}"
-        raise StoreUnreachable(f"{place}: access denied ({_shorten(error)}); {advice}") from None
+        raise AccessDenied(f"{place}: access denied ({_shorten(error)}); {advice}") from None
     except Exception as error:
         raise StoreUnreachable(f"{place}: {_explain(error)}") from None
 

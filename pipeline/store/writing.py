@@ -1,23 +1,29 @@
 """Writing: locks, and an entry that is filled row by row and resumed where an interrupted run stopped.
 
-S3 has no locks, so two processes may write one entry at once. They write the same bytes: each keeps what the other has
-written, and deletes only what no writer of this entry can have written. Keys are therefore listed before metadata is
-read: a writer stores metadata first, so a listed key whose metadata cannot be read is damaged, not new.
+With locks, one process writes an entry, and its arrays lie in the entry's folder. S3 has no locks, so two processes may
+write one entry at once, and their bytes may differ: each writes into a folder of its own, and the completion record
+names the folder that counts. Metadata above these folders is the same for all; keys are listed before it is read: a
+writer stores metadata first, so a listed key whose metadata cannot be read is damaged, not new.
 """
 
 from __future__ import annotations
 
+import asyncio
 import errno
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 import numpy as np
 import zarr
+from zarr.abc.store import Store as ZarrStore
+from zarr.core.buffer import Buffer, default_buffer_prototype
 from zarr.core.sync import sync
-from zarr.errors import ContainsArrayError, ContainsGroupError
+from zarr.errors import ContainsGroupError
 
 from pipeline.errors import DzopError
 from pipeline.spec import canonical
@@ -25,23 +31,33 @@ from pipeline.store.arrays import (
     Layout,
     create_array,
     has_layout,
+    layout_digest,
     list_keys,
     open_array,
-    open_group,
     present_rows,
-    readable_rows,
+    read_attributes,
+    write_attributes,
+    write_bytes,
 )
 from pipeline.store.backends import Announce, Backend
-from pipeline.store.completion import complete_attributes, identity
+from pipeline.store.checksums import ChunkRecorder, chunk_key, is_intact, to_hex
+from pipeline.store.completion import check_format, complete_attributes, completion_record, identity
 from pipeline.store.entry import mark_incomplete
+from pipeline.store.journal import StoredRows, forget_rows, note_rows, read_journal
 from pipeline.store.keys import Ref
+
+MARKER = ".dzop"
+"""Key in every entry, and in the root of a store, by which they are known as ours whatever else is damaged."""
+
+_NOTE_INTERVAL_S = 0.5  # on a local disk a killed run loses at most this much work; on S3 every batch is noted
+_ROWS_AT_ONCE = 32
 
 
 @contextmanager
 def lock_entries(backend: Backend, refs: Sequence[Ref], announce: Announce) -> Iterator[None]:
     """Hold the locks of several entries, always taken in the same order so that processes cannot deadlock.
 
-    Raises DzopError when the disk is full or the store is read-only.
+    Raises DzopError when the disk is full, the store is read-only, or a file is where the store needs a folder.
     """
     with ExitStack() as stack, _explain_disk_errors(backend, refs):
         for ref in sorted(refs, key=lambda ref: ref.path):
@@ -59,33 +75,96 @@ def _explain_disk_errors(backend: Backend, refs: Sequence[Ref]) -> Iterator[None
             raise DzopError(f"{backend.place}: the disk is full; {advice}") from None
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             raise DzopError(f"{backend.place}: the store is read-only here and lacks {refs[0].path}") from None
+        if isinstance(error, NotADirectoryError | FileExistsError | IsADirectoryError):
+            needed = "needs a folder of the store there: move the file away"
+            raise DzopError(f"{error.filename or backend.place}: found a file ({error.strerror}), {needed}") from None
+        if isinstance(error, FileNotFoundError) and backend.folder and str(error.filename).startswith(backend.place):
+            lost = "was removed while an entry was being written; run again"
+            raise DzopError(f"{error.filename}: {lost}") from None
         raise
 
 
 @dataclass(eq=False)
 class EntryWriter:
-    """Fills the arrays of one entry. The caller holds the entry's lock. ``stored``: rows that need no computing."""
+    """Fills the arrays of one entry. The caller holds the entry's lock, if there are locks.
+
+    ``folder``: where the arrays are, relative to the entry. ``checksums``: by array and row, of the rows that need no
+    computing.
+    """
 
     backend: Backend
     ref: Ref
     layouts: Mapping[str, Layout]
     rows: int
-    arrays: Mapping[str, zarr.Array]
-    stored: set[int]
+    name: str
+    folder: str
+    recorder: ChunkRecorder
+    arrays: dict[str, zarr.Array] = field(default_factory=dict)
+    checksums: dict[str, dict[int, bytes]] = field(default_factory=dict)
+    stored: set[int] = field(default_factory=set)
+    _not_noted: list[int] = field(default_factory=list)
+    _noted_s: float = 0.0
+    _has_notes: bool = False
 
     @classmethod
     def open(
         cls, backend: Backend, ref: Ref, layouts: Mapping[str, Layout], rows: int, announce: Announce
     ) -> EntryWriter:
-        """Create the entry, or resume it: intact rows of an interrupted run are kept.
+        """Create the entry, or resume it: intact rows that the journal lists are kept.
 
         Arrays of another layout, or whose metadata was damaged, are replaced: filled again as they are, they would
         never match a completion record.
         """
-        group = open_or_create_group(backend, ref, identity(ref), announce)
-        arrays = {name: _open_or_create_array(backend, group, name, layout, rows) for name, layout in layouts.items()}
-        stored = [readable_rows(backend.zarr, array) for array in arrays.values()]
-        return cls(backend, ref, layouts, rows, arrays, set.intersection(*stored) if stored else set())
+        name = token_hex(8)
+        folder = "" if backend.has_locks else name
+        writer = cls(backend, ref, layouts, rows, name, folder, ChunkRecorder(backend.zarr))
+        open_or_create_group(backend, ref, identity(ref), announce)
+        journal = read_journal(backend.zarr, ref, writer._digests)
+        for array, layout in layouts.items():
+            path = writer._path(folder, array)
+            create = create_array if folder else _open_or_create_array
+            writer.arrays[array] = create(writer.recorder, path, layout, rows)
+            writer.checksums[array] = {}
+        for found in journal:
+            writer._keep(found)
+        writer._has_notes = bool(journal)
+        writer._noted_s = time.monotonic()
+        return writer
+
+    @property
+    def _digests(self) -> dict[str, str]:
+        return {name: layout_digest(layout, self.rows) for name, layout in self.layouts.items()}
+
+    def _path(self, folder: str, array: str) -> str:
+        return "/".join(filter(None, [self.ref.path, folder, array]))
+
+    def _keys(self, folder: str, row: int) -> dict[str, str]:
+        """Array name -> key of a row's chunk."""
+        ndims = {name: 1 + len(layout.row) for name, layout in self.layouts.items()}
+        return {name: chunk_key(self._path(folder, name), ndim, row) for name, ndim in ndims.items()}
+
+    def _keep(self, found: StoredRows) -> None:
+        """Keep the rows of the journal that are intact; those of another writer's folder are copied."""
+        rows = sorted(found.rows.intersection(range(self.rows)).difference(self.stored))
+        for first in range(0, len(rows), _ROWS_AT_ONCE):
+            sync(self._keep_rows(found, rows[first : first + _ROWS_AT_ONCE]))
+
+    async def _keep_rows(self, found: StoredRows, rows: Sequence[int]) -> None:
+        await asyncio.gather(*(self._keep_row(found, row) for row in rows))
+
+    async def _keep_row(self, found: StoredRows, row: int) -> None:
+        checksums = {name: found.checksums[name][row] for name in self.layouts}
+        source, target = self._keys(found.folder, row), self._keys(self.folder, row)
+        chunks = {name: await _get_intact(self.backend.zarr, source[name], checksums[name]) for name in source}
+        if any(chunk is None for chunk in chunks.values()):
+            return
+        if found.folder != self.folder:
+            await asyncio.gather(
+                *(self.backend.zarr.set(target[n], chunk) for n, chunk in chunks.items() if chunk is not None)
+            )
+        for name, checksum in checksums.items():
+            self.checksums[name][row] = checksum
+        self.stored.add(row)
 
     def has(self, rows: Sequence[int]) -> bool:
         """Whether all of these rows are stored."""
@@ -98,37 +177,86 @@ class EntryWriter:
             if block.shape != (len(rows), *array.shape[1:]):
                 raise AssertionError(f"{name}: rows of shape {block.shape}, array {array.shape}")
             array[rows[0] : rows[-1] + 1] = block
+        for row in rows:
+            for name, key in self._keys(self.folder, row).items():
+                self.checksums[name][row] = self.recorder.written.pop(key)
+        self.stored.update(rows)
+        self._not_noted += rows
+        due = not self.backend.has_locks or time.monotonic() - self._noted_s > _NOTE_INTERVAL_S
+        if due and len(self.stored) < self.rows:  # completion follows the last batch at once
+            self.note()
+
+    def note(self) -> None:
+        """Add what was stored since the last call to the journal."""
+        for first, last in _runs(sorted(self._not_noted)):
+            note_rows(
+                self.backend.zarr, self.ref, self.name, folder=self.folder, first=first,
+                arrays=self._digests, chunks=self._hex_checksums(range(first, last + 1)),
+            )  # fmt: skip
+        self._not_noted, self._noted_s, self._has_notes = [], time.monotonic(), True
+
+    def _hex_checksums(self, rows: Sequence[int]) -> dict[str, str]:
+        return {name: to_hex(checksums, rows) for name, checksums in self.checksums.items()}
 
     def complete(self, document: Any, time_s: float) -> None:
-        """Write the completion record. Raises DamagedEntry when another process removed rows meanwhile."""
-        group = open_group(self.backend.zarr, self.ref.path)
-        if group is None or any(self._lacks_rows(array) for array in self.arrays.values()):
+        """Write the completion record, unless another process has completed the entry with rows of its own.
+
+        Raises DamagedEntry when another process removed rows meanwhile.
+        """
+        (attributes,) = read_attributes(self.backend.zarr, [self.ref.path])
+        if attributes is not None and completion_record(attributes, self.ref.key) is not None:
+            return
+        if attributes is None or any(self._lacks_rows(array) for array in self.arrays.values()):
             raise mark_incomplete(self.backend, self.ref, "it was removed while it was being written")
         nbytes = sum(layout.nbytes(self.rows) for layout in self.layouts.values())
-        attributes = complete_attributes(self.ref, self.arrays, document, rows=self.rows, time_s=time_s, nbytes=nbytes)
-        group.attrs.put(attributes)
+        attributes = complete_attributes(
+            self.ref, self.arrays, document, rows=self.rows, time_s=time_s, nbytes=nbytes,
+            folder=self.folder, chunks=self._hex_checksums(range(self.rows)),
+        )  # fmt: skip
+        write_attributes(self.backend.zarr, self.ref.path, attributes)
+        if self._has_notes:
+            forget_rows(self.backend.zarr, self.ref)
 
     def _lacks_rows(self, array: zarr.Array) -> bool:
         return len(present_rows(self.backend.zarr, array)) < self.rows
 
 
-def open_or_create_group(backend: Backend, ref: Ref, attributes: Mapping[str, Any], announce: Announce) -> zarr.Group:
-    """The entry's group; ``attributes`` are written if it is new or was made from something else.
+async def _get_intact(store: ZarrStore, key: str, checksum: bytes) -> Buffer | None:
+    chunk = await store.get(key, default_buffer_prototype())
+    return chunk if chunk is not None and is_intact(chunk.to_bytes(), checksum) else None
 
-    Also removes the entry's temporary files: only a local store has any, and we hold the lock.
+
+def _runs(rows: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """First and last of every run of consecutive numbers."""
+    start = 0
+    for i in range(1, len(rows) + 1):
+        if i == len(rows) or rows[i] != rows[i - 1] + 1:
+            yield rows[start], rows[i - 1]
+            start = i
+
+
+def open_or_create_group(backend: Backend, ref: Ref, attributes: Mapping[str, Any], announce: Announce) -> None:
+    """Make sure that the entry's group exists; ``attributes`` are written if it is new or was made from something else.
+
+    Also removes the entry's temporary files: only a local store has any, and we hold the lock. Raises NewerEntry for
+    an entry of a newer format.
     """
     with _lock_parent_groups(backend, ref, announce):
-        keys, group = list_keys(backend.zarr, ref.path), open_group(backend.zarr, ref.path)
-        if group is not None and _has_identity(group, ref):
+        keys, (found,) = list_keys(backend.zarr, ref.path), read_attributes(backend.zarr, [ref.path])
+        if found is not None:
+            check_format(found, f"{backend.place}/{ref.path}")
+        if found is not None and _has_identity(found, ref):
             for key in [key for key in keys if key.endswith(".partial")]:
                 sync(backend.zarr.delete(key))
-            return group
-        if keys:
+            return
+        marker = f"{ref.path}/{MARKER}"
+        if set(keys) - {marker}:
             sync(backend.zarr.delete_dir(ref.path))
+        write_bytes(backend.zarr, marker, ref.key.encode())
         try:
-            return zarr.create_group(backend.zarr, path=ref.path, attributes=dict(attributes))
-        except ContainsGroupError:
-            return zarr.open_group(backend.zarr, path=ref.path, mode="r+", zarr_format=3)
+            zarr.create_group(backend.zarr, path=ref.path, attributes=dict(attributes))
+        except ContainsGroupError:  # another process created it since the listing
+            return
 
 
 @contextmanager
@@ -150,25 +278,19 @@ def _remove_temporary_files(folder: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _open_or_create_array(backend: Backend, group: zarr.Group, name: str, layout: Layout, rows: int) -> zarr.Array:
-    path = f"{group.path}/{name}"
-    keys, found = list_keys(backend.zarr, path), open_array(group, name)
+def _open_or_create_array(store: ZarrStore, path: str, layout: Layout, rows: int) -> zarr.Array:
+    found = open_array(store, path)
     if found is not None and has_layout(found, layout, rows):
         return found
-    if keys:
-        sync(backend.zarr.delete_dir(path))
-    try:
-        return create_array(group, name, layout, rows)
-    except ContainsArrayError:  # another process created it since the listing
-        created = open_array(group, name)
-        assert created is not None
-        return created
+    if list_keys(store, path):
+        sync(store.delete_dir(path))
+    return create_array(store, path, layout, rows)
 
 
-def _has_identity(group: zarr.Group, ref: Ref) -> bool:
+def _has_identity(attributes: Mapping[str, Any], ref: Ref) -> bool:
     expected = identity(ref)
     try:
-        return canonical({name: group.attrs.get(name) for name in expected}) == canonical(expected)
+        return canonical({name: attributes.get(name) for name in expected}) == canonical(expected)
     except ValueError:  # a damaged byte turned a number into NaN
         return False
 

@@ -15,21 +15,25 @@ from pipeline.store import DamagedEntry, S3StoreConfig, Store
 from pipeline.store.remote import StoreUnreachable
 from tests.store.test_store import LAYOUT, REF, ROWS, compute, fill, values
 
-CHUNK = f"cache/{REF.path}/maps/c/3/0/0"
+
+def chunk_key(s3) -> str:
+    """Key of row 3 of the entry, in the folder that its completion record names."""
+    return f"cache/{REF.path}/{Store(s3.config()).read(REF).record['folder']}/maps/c/3/0/0"
 
 
 def test_a_flipped_byte_and_a_missing_chunk_are_detected_and_repaired(s3):
     store = Store(s3.config())
     fill(store)
-    intact = s3.get(CHUNK)
+    intact = s3.get(chunk_key(s3))
     for damaged in (bytes([intact[0] ^ 1]) + intact[1:], intact[:-3], None):
-        s3.delete(CHUNK) if damaged is None else s3.put(CHUNK, damaged)
+        chunk = chunk_key(s3)
+        s3.delete(chunk) if damaged is None else s3.put(chunk, damaged)
         with pytest.raises(DamagedEntry, match="run again to recompute only what is damaged"):
             store.read(REF).array("maps")
         log: list[list[int]] = []
         fill(store, log)
         assert log == [[0, 1, 2, 3]]
-        assert s3.get(CHUNK) == intact
+        assert s3.get(chunk_key(s3)) == intact
         np.testing.assert_array_equal(store.read(REF).array("maps"), values(list(range(ROWS))))
 
 

@@ -239,7 +239,7 @@ def test_a_killed_process_leaves_no_entry_that_looks_complete_and_no_lock(tmp_pa
     process = context.Process(target=_fill_slowly, args=(str(tmp_path / "cache"), started, str(tmp_path / "pid")))
     process.start()
     assert started.wait(60)
-    time.sleep(0.3)
+    time.sleep(1.5)  # rows are noted every half second
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     store = Store(LocalStoreConfig(root=str(tmp_path / "cache")))
