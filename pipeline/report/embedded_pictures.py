@@ -9,6 +9,7 @@ from pathlib import Path
 
 import PIL.Image
 
+from pipeline.io.files import IMAGE_FORMATS
 from pipeline.report.run_records import Case, RunRecord
 
 MAX_BYTES = 9_000_000
@@ -37,7 +38,7 @@ class PictureEmbedder:
         pictures = []
         for case in run.cases:
             path = self.out / run.folder / case.file
-            data = _small_jpeg(path) if path.is_file() else b""
+            data = small_jpeg(path) if path.is_file() else b""
             if not data or self.used_bytes + len(data) > MAX_BYTES:
                 self.skipped += 1
                 continue
@@ -51,12 +52,12 @@ def _caption(case: Case) -> str:
     return f"scene {case.scene_id}, image {case.im_id}, object {case.obj_id}: {case.text}{error}"
 
 
-def _small_jpeg(path: Path) -> bytes:
+def small_jpeg(path: Path) -> bytes:
     """The picture at most as wide as a card, compressed; empty for a file that cannot be read."""
     try:
-        with PIL.Image.open(path) as opened:
+        with PIL.Image.open(path, formats=IMAGE_FORMATS) as opened:
             picture = opened.convert("RGB")
-    except (OSError, SyntaxError, ValueError):
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError):
         return b""
     if picture.width > _CARD_PX:
         picture = picture.resize((_CARD_PX, round(picture.height * _CARD_PX / picture.width)))

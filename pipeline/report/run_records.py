@@ -202,8 +202,24 @@ def _check_types(content: Mapping[str, Any]) -> None:
         raise TypeError("times_s has a value that is not a number")
 
 
+def _check_places(content: Mapping[str, Any]) -> None:
+    """Raise ValueError for a path that leads out of the results folder, or a name that is none."""
+    paths = [content.get("folder", ""), content.get("csv", ""), *(case.get("file", "") for case in content["cases"])]
+    for path in map(str, paths):
+        if Path(path).is_absolute() or ".." in Path(path).parts or "\0" in path:
+            raise ValueError(f"{path[:80]!r} lies outside the results folder")
+    names = [
+        content.get("method", ""),
+        *(str((content.get("dataset") or {}).get(key, "")) for key in ("name", "split")),
+    ]
+    for name in names:
+        if "/" in name or "\\" in name or "\0" in name or name in (".", ".."):
+            raise ValueError(f"{name[:80]!r} is no name")
+
+
 def _from_json(content: dict[str, Any]) -> RunRecord:
     _check_types(content)
+    _check_places(content)
     dataset = content.pop("dataset")
     cases = tuple(Case(**case) for case in content.pop("cases"))
     scores = content.pop("scores")

@@ -91,3 +91,23 @@ def test_all_broken_records_are_counted(tmp_path):
 def test_missing_records_say_how_to_make_some(tmp_path):
     with pytest.raises(BadInput, match="run step=all"):
         read_run_records(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda content: content.update(folder="../../outside"),
+        lambda content: content.update(folder="/etc"),
+        lambda content: content["cases"][0].update(file="../../../etc/passwd"),
+        lambda content: content["dataset"].update(name="../../"),
+        lambda content: content["dataset"].update(split="a/b"),
+        lambda content: content.update(method="..\\up"),
+    ],
+)
+def test_a_record_that_leads_out_of_the_results_folder_is_refused(tmp_path, spoil):
+    path = write_run_record(tmp_path, record())
+    content = json.loads(path.read_text())
+    spoil(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(BadInput, match=r"lies outside the results folder|is no name"):
+        read_run_record(path)
