@@ -15,6 +15,7 @@ from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -263,6 +264,7 @@ def _connect(address: str) -> None:
     if ray.is_initialized():
         return
     _check_reachable(address)
+    protect_auth_token()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"address": address}
     if address == "local":
@@ -271,6 +273,17 @@ def _connect(address: str) -> None:
         ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # Ray raises a plain Exception when a node does not start in time
         raise BadInput("runtime.address", found=f"{address} ({_first_line(error)})", needed=_ADDRESSES) from None
+
+
+def protect_auth_token() -> None:
+    """Make Ray's token file readable by its owner only: whoever has it can run code on the cluster."""
+    path = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
+    try:
+        if path.is_file() and path.stat().st_mode & 0o077:
+            path.chmod(0o600)
+    except OSError as error:
+        found = f"a token that others may read ({error.strerror})"
+        raise BadInput(path, found=found, needed="a file that only its owner may read: chmod 600") from None
 
 
 def _check_reachable(address: str) -> None:

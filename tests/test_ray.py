@@ -139,3 +139,14 @@ def test_impossible_settings_are_reported_before_a_cluster_is_started(
     assert ran.status == 1
     assert ran.err.startswith(f"error: {message}")
     assert len(ran.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o666])
+def test_rays_token_is_made_private(tmp_path, monkeypatch, mode):
+    ray_workers = pytest.importorskip("pipeline.ray_workers", reason="needs Ray: pip install 'dzop[ray]'")
+    token = tmp_path / "auth_token"
+    token.write_text("secret")
+    token.chmod(mode)
+    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(token))
+    ray_workers.protect_auth_token()
+    assert token.stat().st_mode & 0o777 == 0o600
