@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.bop.pixels import MAX_MEGAPIXELS, check_megapixels, scale_to_8_bits, select_object
 from pipeline.errors import BadInput
-from pipeline.io.digests import unchanged_files
+from pipeline.io.digests import file_digest, unchanged_files
 from pipeline.io.files import IMAGE_FORMATS, read_file
+from pipeline.spec import digest
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -68,6 +69,26 @@ _UPRIGHT = {
     8: PIL.Image.Transpose.ROTATE_90,
 }
 _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
+
+
+def image_digest(path: Path) -> str:
+    """Digest of an image as it is read: of its file, and of its EXIF orientation where the file has one.
+
+    What the readers above do to some files only belongs into ``_special_rules``, so that the keys of others stay.
+    """
+    content = file_digest(path)
+    try:
+        with unchanged_files([path]), _open_header(path) as image:
+            rules = _special_rules(image)
+    except _BROKEN:
+        rules = []
+    return digest([content, rules]) if rules else content
+
+
+def _special_rules(image: PIL.Image.Image) -> list[str]:
+    """What is done to this image that is not done to a plain one; with a number where the rule has changed."""
+    orientation = _read_orientation(image)
+    return [] if orientation not in _UPRIGHT else [f"EXIF orientation {orientation}"]
 
 
 def image_size(path: Path) -> tuple[int, int]:

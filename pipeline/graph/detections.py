@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
+from pipeline.bop.images import image_digest
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
-from pipeline.io.digests import files_digest
+from pipeline.io.digests import file_digest
 from pipeline.items.records import detection_from_record, detection_to_record
 from pipeline.items.views import Detection
 from pipeline.spec import digest
@@ -35,9 +39,8 @@ class DetectionNodes:
         """Digests of what the detector reads: files, or features of proposals and templates."""
         proposals, context = self.proposals, self.context
         if proposals is None:
-            root, files = context.dataset.root, context.stages.detect.sources(context.dataset, context.targets)
-            named = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
-            return {"sources": files_digest(named)}
+            files = context.stages.detect.sources(context.dataset, context.targets)
+            return {"sources": _digest_sources(files, context.dataset.root)}
         objects = {f"object {obj_id}": proposals.template_features(obj_id).key for obj_id in context.object_ids}
         images = {f"image {s}/{i}": proposals.features((s, i)).key for s, i in context.image_ids}
         return objects | images
@@ -76,3 +79,15 @@ class DetectionNodes:
             context.run_task(proposals.propose_task, context.image_ids, advance)
         templates = {obj_id: proposals.template_descriptors(obj_id) for obj_id in context.object_ids}
         return Descriptors(templates, proposals.image_descriptors)
+
+
+def _digest_sources(files: Sequence[Path], root: Path) -> str:
+    """Digest of a detector's files, independent of where the dataset lies. Each file counts, whatever its name."""
+    digest_of: dict[str, str] = {}
+    for path in dict.fromkeys(files):
+        name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+        while name in digest_of:
+            name += "'"  # a photograph and its mask often have one name, in different folders
+        digest_of[name] = file_digest(path) if path.suffix in (".json", ".gz") else image_digest(path)
+    lines = "".join(f"{name}\0{content}\n" for name, content in sorted(digest_of.items()))
+    return sha256(lines.encode()).hexdigest()

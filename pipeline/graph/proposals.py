@@ -10,13 +10,13 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 
+from pipeline.bop.images import image_digest
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.descriptors import pool_foreground
 from pipeline.graph.context import Context, ImageId, stack_crops
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import TemplateNodes
-from pipeline.io.digests import file_digest
 from pipeline.items.records import proposal_from_record, proposal_to_record
 from pipeline.items.views import Crops, Proposal
 from pipeline.spec import digest
@@ -91,7 +91,7 @@ class ProposalNodes:
         """Proposals of an image."""
         if image not in self._proposal_refs:
             recipe = {"kind": "proposals", "proposals": self.describer.proposer.recipe()}
-            inputs = {"image": file_digest(self.context.dataset.image_path(*image))}
+            inputs = {"image": image_digest(self.context.dataset.image_path(*image))}
             self._proposal_refs[image] = make_ref("proposals", recipe, inputs)
         return self._proposal_refs[image]
 

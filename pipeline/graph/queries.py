@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from pipeline.bop.images import image_digest
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
@@ -16,12 +17,11 @@ from pipeline.graph.context import Context, ImageId, stack_crops
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
-from pipeline.io.digests import file_digest
 from pipeline.items.features import CropFeatures
 from pipeline.items.online import Query
 from pipeline.items.views import Crop, Crops, Detection, Geometry
 from pipeline.spec import digest
-from pipeline.stages.render.raycast import render_depth
+from pipeline.stages.render.raycast import DEPTH_VERSION, render_depth
 from pipeline.store import Ref, make_ref
 
 
@@ -71,7 +71,7 @@ class QueryNodes:
     def _crops(self, image: ImageId) -> Ref:
         shown = [[d.obj_id, list(d.bbox_xyxy), d.rle] for _, d in self.of_image[image]]
         recipe = {"kind": "query crops", "crop": self.context.stages.crop.recipe()}
-        inputs = {"image": file_digest(self.context.dataset.image_path(*image)), "detections": digest(shown)}
+        inputs = {"image": image_digest(self.context.dataset.image_path(*image)), "detections": digest(shown)}
         if self.context.stages.crop.needs_camera:
             inputs["camera"] = digest(self.context.K(image).tolist())
         return make_ref("crops", recipe, inputs)
@@ -84,7 +84,8 @@ class QueryNodes:
                 [d.obj_id, self.context.mesh_digest(d.obj_id), self.true_pose(d).tolist()]
                 for _, d in self.of_image[image]
             ]
-            inputs["geometry"] = digest([poses, self.context.K(image).tolist()])
+            version = [] if DEPTH_VERSION == 1 else [DEPTH_VERSION]
+            inputs["geometry"] = digest([poses, self.context.K(image).tolist(), *version])
         return self.context.features(layer, inputs)
 
     @cached_property

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.bop.images import image_digest
 from pipeline.bop.results import ResultRow
 from pipeline.graph.context import Context
 from pipeline.graph.plan import Node
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.replay import Replayer
 from pipeline.graph.templates import TemplateNodes
-from pipeline.io.digests import files_digest
+from pipeline.io.digests import file_exists, files_digest
 from pipeline.items.errors import PoseErrors, TemplateError
 from pipeline.items.online import Hypothesis
 from pipeline.items.poses import PoseEstimate
@@ -27,6 +28,7 @@ from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
 from pipeline.scoring import SCORES_VERSION, Scorer, ScoringResult, truth_digest
 from pipeline.spec import digest
+from pipeline.stages.render.raycast import DEPTH_VERSION
 from pipeline.store import Ref, make_ref
 
 Instance = tuple[int, int, int, int]
@@ -63,13 +65,21 @@ class ScoreNodes:
         scorer, data = self.scorer, self.context.dataset
         recipe = {"kind": "scores", "version": SCORES_VERSION, "vsd_delta_mm": scorer.vsd_delta_mm}
         recipe |= {"correspondences": True} if self.replayer else {}
-        depth = "" if scorer.no_vsd else files_digest({str(image): data.depth_path(*image) for image in scorer.images})
         meshes = {str(obj_id): data.model_path(obj_id, folder=scorer.models) for obj_id in self.context.object_ids}
         info = data.model_path(0, folder=scorer.models).with_name("models_info.json")
-        if info.exists():
+        if file_exists(info):
             meshes["info"] = info
-        inputs = {"poses": self.poses.run_ref().key, "truth": truth_digest(scorer), "depth": depth or scorer.no_vsd}
+        inputs = {"poses": self.poses.run_ref().key, "truth": truth_digest(scorer), "depth": self._depth_digest()}
         return make_ref("scores", recipe, inputs | {"meshes": files_digest(meshes)})
+
+    def _depth_digest(self) -> str:
+        """Digest of the measured depth in mm and of the code that it is compared with; why there is none without it."""
+        scorer, data = self.scorer, self.context.dataset
+        if scorer.no_vsd:
+            return scorer.no_vsd
+        files = [image_digest(data.depth_path(*image)) for image in scorer.images]
+        scales = [data.scene(scene_id).camera(im_id).depth_scale for scene_id, im_id in scorer.images]
+        return digest([files, scales, DEPTH_VERSION])
 
     def node(self) -> Node:
         """The entry as a plan shows it."""

@@ -1,6 +1,6 @@
 """Answers, evaluation -> pictures: an overlay for every image, and a gallery of how poses came about.
 
-The folder's name is the key of everything the pictures show, so pictures that exist are not drawn again.
+Every picture holds the digest of what it shows: poses, ground truth and scores. It is drawn again when that changes.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from pipeline.items.records import Answer
 from pipeline.outputs.files import errors_by_answer
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.gallery import Card, draw_card, pick_cases
-from pipeline.report.overlay import DrawnPose, draw_overlay, write_overlay
+from pipeline.report.overlay import DrawnPose, draw_overlay, shows, write_overlay
 from pipeline.report.run_records import Case
+from pipeline.spec import digest
 
 GALLERY_JPEG_QUALITY = 82
+PICTURES_VERSION = 1
+"""Raise it when pictures of the same results look different."""
 
 
 @dataclass(eq=False)
@@ -34,6 +37,12 @@ class Pictures:
     folder: OutputFolder
     answers: Sequence[Answer]
     evaluation: PoseEvaluation | None
+
+    @cached_property
+    def made_from(self) -> str:
+        """Digest of everything that the pictures show. Images, meshes and cameras are in the key of the poses."""
+        scores = None if self.folder.scores is None else self.folder.scores.ref.key
+        return digest([PICTURES_VERSION, self.folder.graph.poses.run_ref().key, scores])
 
     @cached_property
     def errors(self) -> Sequence[PoseErrors | None]:
@@ -49,8 +58,9 @@ class Pictures:
         with context.progress.bar(len(by_image), "overlays", "image") as advance:
             for image, indices in sorted(by_image.items()):
                 path = self.folder.overlays / f"{image[0]:06d}_{image[1]:06d}.jpg"
-                if not path.exists():
-                    write_overlay(path, draw_overlay(context.dataset.image(*image), self._poses_to_draw(indices)))
+                if not shows(path, self.made_from):
+                    picture = draw_overlay(context.dataset.image(*image), self._poses_to_draw(indices))
+                    write_overlay(path, picture, made_from=self.made_from)
                     drawn += 1
                 advance(1)
         self._count("overlays", drawn, len(by_image), start)
@@ -66,13 +76,14 @@ class Pictures:
         with self.folder.context.progress.bar(len(chosen), "gallery", "picture") as advance:
             for index in sorted(chosen, key=lambda i: self.answers[i].obj_id):  # reads each object's templates once
                 path = self.folder.path / _gallery_file(self.answers[index])
-                if not path.exists() and (replayed := replay(self.answers[index])) is not None:
-                    write_overlay(path, draw_card(self._card(index, replayed)), quality=GALLERY_JPEG_QUALITY)
+                if not shows(path, self.made_from) and (replayed := replay(self.answers[index])) is not None:
+                    picture = draw_card(self._card(index, replayed))
+                    write_overlay(path, picture, quality=GALLERY_JPEG_QUALITY, made_from=self.made_from)
                     drawn += 1
                 advance(1)
         self._count("gallery", drawn, len(chosen), start)
         cases = [self._case(index) for index in chosen]
-        return [case for case in cases if (self.folder.path / case.file).exists()]
+        return [case for case in cases if shows(self.folder.path / case.file, self.made_from)]
 
     def _count(self, step: str, drawn: int, total: int, start: float) -> None:
         seconds = time.perf_counter() - start

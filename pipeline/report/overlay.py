@@ -60,11 +60,26 @@ def draw_overlay(image: Image, items: Sequence[DrawnPose], *, legend: bool = Tru
     return write_labels(canvas, _labels(ordered, K), roles if legend else [])
 
 
-def write_overlay(path: Path, picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 90) -> None:
-    """Write a picture atomically, in the format of its suffix (.jpg, .png)."""
-    stream = io.BytesIO()
-    PIL.Image.fromarray(picture).save(stream, PIL.Image.registered_extensions()[path.suffix], quality=quality)
+def write_overlay(
+    path: Path, picture: UInt8[np.ndarray, "H W 3"], *, quality: int = 90, made_from: str | None = None
+) -> None:
+    """Write a picture atomically, in the format of its suffix (.jpg, .png).
+
+    ``made_from``: digest of everything that the picture shows, kept in the comment of a JPEG; see ``shows``.
+    """
+    stream, options = io.BytesIO(), {} if made_from is None else {"comment": made_from}
+    file_format = PIL.Image.registered_extensions()[path.suffix]
+    PIL.Image.fromarray(picture).save(stream, file_format, quality=quality, **options)
     write_atomic(path, stream.getvalue())
+
+
+def shows(path: Path, made_from: str) -> bool:
+    """Whether the file is a picture that was written with this ``made_from``."""
+    try:
+        with PIL.Image.open(path, formats=["JPEG"]) as picture:
+            return picture.info.get("comment") == made_from.encode()
+    except (OSError, SyntaxError, ValueError):
+        return False
 
 
 def clip_to_front(segments_cam: Float[np.ndarray, "e 2 3"], *, near_mm: float = _NEAR_MM) -> Float[np.ndarray, "k 2 3"]:

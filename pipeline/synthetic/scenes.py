@@ -23,6 +23,9 @@ from pipeline.synthetic.parts import Rng
 from pipeline.synthetic.photograph import Wall, render_photograph
 
 SCENE_ID = 1
+GENERATOR_VERSION = 1
+"""Raise it when the same arguments give other images, poses or meshes: datasets of other versions are not used."""
+INFO = "dataset_info.json"
 _DEPTH_SCALE = 0.1  # mm per unit of the depth images
 _DISTRACTORS = 6  # objects that occlude and clutter; the dataset has no models of them
 
@@ -53,7 +56,8 @@ def write_dataset(
         partial.chmod(0o755)
         models = {k + 1: make_object(1000 * seed + k) for k in range(objects)}
         arguments = {"objects": objects, "images": images, "seed": seed, "size_hw": list(size_hw)}
-        _write_json(partial / "dataset_info.json", arguments | {"per_image": per_image, "occluded": occluded})
+        arguments |= {"per_image": per_image, "occluded": occluded, "generator": GENERATOR_VERSION}
+        _write_json(partial / INFO, arguments)
         _write_models(partial, models, size_hw)
         _write_scene(partial, models, images, seed, size_hw, min(per_image, objects), occluded, progress)
         partial.replace(root)

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 from pipeline.errors import BadInput
@@ -24,6 +25,8 @@ from pipeline.items.objects import Mesh
 __all__ = ["SUFFIXES", "diameter_mm", "mesh_digest", "read_mesh", "write_ply"]
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+READER_VERSIONS = dict.fromkeys(SUFFIXES, 1)
+"""Raise the number of a format when the same file gives another mesh. It is part of the mesh's digest from 2 on."""
 _READABLE = "a readable mesh file"
 
 
@@ -38,7 +41,7 @@ def read_mesh(path: Path) -> Mesh:
     companions = Companions(path)
     mesh = _parse(path, companions)
     check_mesh(path, mesh)
-    return replace(mesh, digest=companions.digest())
+    return replace(mesh, digest=_digest(path, companions))
 
 
 def mesh_digest(path: Path) -> str:
@@ -50,7 +53,13 @@ def mesh_digest(path: Path) -> str:
     name = texture_name(read_header(path, read_file(path, _READABLE)))
     if name is not None:
         companions.read(name)
-    return companions.digest()
+    return _digest(path, companions)
+
+
+def _digest(path: Path, companions: Companions) -> str:
+    """Digest of the files that were read, and of the reader's version."""
+    version, files = READER_VERSIONS[path.suffix.lower()], companions.digest()
+    return files if version == 1 else sha256(f"{files}, reader {version}".encode()).hexdigest()
 
 
 def _check_path(path: Path) -> Path:

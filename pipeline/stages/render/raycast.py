@@ -17,6 +17,9 @@ from pipeline.spec import spec
 from pipeline.stages.render.cameras import RenderSpec, subpixels
 from pipeline.stages.render.ray_mesh import Hits, Surface, get_caster, get_surface, ray_directions
 
+DEPTH_VERSION = 1
+"""Version of ``render_depth``, on which scores and oracles depend. When depth changes, raise it and Raycast.version."""
+
 
 @spec
 class Raycast(RenderSpec):
