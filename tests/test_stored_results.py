@@ -24,7 +24,7 @@ def answers(out: Path) -> list[dict]:
 
 
 RECOMPUTED = {"poses", "scores"}
-"""Version 3 of the poses: the solver's threshold follows the size of the crop."""
+"""Version 3 of the poses: the solver's threshold follows the size of the crop. Scores: their key has depth_scale."""
 
 
 @pytest.mark.parametrize("name", METHODS)

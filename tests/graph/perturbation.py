@@ -47,11 +47,11 @@ class TinyRun:
     evaluate: Evaluate = Evaluate()  # noqa: RUF009
     runtime: Runtime = Runtime(device="cpu", progress=False)  # noqa: RUF009
 
-    def graph(self) -> tuple[Graph, ScoreNodes | None]:
-        """The run's nodes with an empty store. Raises BadInput for settings that a run refuses."""
+    def graph(self, store: Store | None = None) -> tuple[Graph, ScoreNodes | None]:
+        """The run's nodes, by default with an empty store. Raises BadInput for settings that a run refuses."""
         data, evaluate = self.open(), self.evaluate
         evaluate.check_theta_max()
-        store = Store(MemoryStoreConfig())
+        store = store or Store(MemoryStoreConfig())
         graph = Graph(Context(self.stages, data, self.select.targets(data), store, self.runtime))
         graph.check()
         if not all(data.has_ground_truth(target.scene_id) for target in data.targets):
@@ -70,14 +70,23 @@ class TinyRun:
             return paths
 
     def contents(self) -> dict[str, str]:
-        """Digest of each entry's arrays and document, by its path."""
+        """Digest of each entry that the run stores, by its path."""
+        store = Store(MemoryStoreConfig())
         with track_files():
-            graph, scores = self.graph()
-            answers = graph.estimate()
-            if scores is not None:
-                scores.evaluate(answers)
-        store = graph.context.store
-        return {info.path: _digest_entry(store, info) for info in list_entries(store)}
+            self.compute(store)
+        return digest_entries(store)
+
+    def compute(self, store: Store) -> None:
+        """Estimate and score."""
+        graph, scores = self.graph(store)
+        answers = graph.estimate()
+        if scores is not None:
+            scores.evaluate(answers)
+
+
+def digest_entries(store: Store) -> dict[str, str]:
+    """Digest of each complete entry's arrays and document, by its path."""
+    return {info.path: _digest_entry(store, info) for info in list_entries(store) if info.complete}
 
 
 def _digest_entry(store: Store, info: Any) -> str:
