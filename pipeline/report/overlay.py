@@ -117,7 +117,7 @@ def _labels(items: Sequence[DrawnPose], K: Float[np.ndarray, "3 3"]) -> list[tup
     return labels
 
 
-def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> list[Float[np.ndarray, "m 2"]]:
+def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> list[Float[np.ndarray, "_m 2"]]:
     """Closed outlines (and holes) of the silhouette, pixels, smoothed over five contour points."""
     if transform(item.T_cam_obj, _corners(item.mesh))[:, 2].max() < _NEAR_MM:
         return []
@@ -127,7 +127,7 @@ def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, 
     return [_smooth(contour) - margin for contour in _contours(depth > 0)]
 
 
-def _contours(mask: Bool[np.ndarray, "H W"]) -> list[Float[np.ndarray, "m 2"]]:
+def _contours(mask: Bool[np.ndarray, "H W"]) -> list[Float[np.ndarray, "_m 2"]]:
     found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     return [contour[:, 0].astype(np.float64) for contour in found if len(contour) >= 16]
 
@@ -138,7 +138,7 @@ def _smooth(contour: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m+1 2"]:
 
 
 def _draw_lines(
-    canvas: UInt8[np.ndarray, "H W 3"], lines: Sequence[Float[np.ndarray, "m 2"]], colour: Colour, thickness: int
+    canvas: UInt8[np.ndarray, "H W 3"], lines: Sequence[Float[np.ndarray, "_m 2"]], colour: Colour, thickness: int
 ) -> None:
     """Draw lines onto the canvas, anti-aliased, with a thin dark border so that they show on bright backgrounds."""
     fixed = [np.round(px * (1 << _SUBPIXEL_BITS)).astype(np.int32) for px in lines if np.abs(px).max() < _FAR_PX]
