@@ -204,15 +204,13 @@ def test_lint_notices_metres_and_rounded_rotations(dzop):
 
 @pytest.mark.slow
 def test_lmo_is_scored_at_a_hundred_targets_a_minute_or_more(bop_mini):
-    """1,425 estimates, as many as LM-O's test set has: 285 targets, a fifth of it, each rotated by five angles."""
+    """855 estimates: 285 targets, a fifth of LM-O's test set, each rotated by three angles."""
     root = bop_mini / "lmo"
     data = open_dataset(root, name="lmo", models="models_eval", photographs=False)
     scorer, rows = Scorer(data, data.targets, "models_eval"), true_rows(root, "lmo", "models_eval")
     start = time.perf_counter()
-    recalls = [
-        average_recall(scorer.score([rotate(row, angle) for row in rows]).scores) for angle in (5, 10, 20, 40, 90)
-    ]
-    assert time.perf_counter() - start < 5 * 285 / 100 * 60
+    recalls = [average_recall(scorer.score([rotate(row, angle) for row in rows]).scores) for angle in (5, 20, 90)]
+    assert time.perf_counter() - start < 3 * 285 / 100 * 60
     assert [r.mspd for r in recalls] == sorted((r.mspd for r in recalls), reverse=True)
     assert recalls[0].mssd > 0.9
     assert recalls[-1].mssd < 0.2

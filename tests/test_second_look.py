@@ -43,7 +43,7 @@ STAGES = replace(
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> Dataset:
     root = tmp_path_factory.mktemp("second_look") / "scenes"
-    write_dataset(root, objects=2, images=6, per_image=2, occluded=0.3, seed=5, progress=False)
+    write_dataset(root, objects=2, images=4, per_image=2, occluded=0.3, seed=5, progress=False)
     return open_dataset(root, name="second_look")
 
 

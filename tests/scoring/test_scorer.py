@@ -1,5 +1,8 @@
 """Scores of whole datasets: real ground truth, and a tiny dataset where two instances share an image."""
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,7 +13,7 @@ from pipeline.bop.results import ResultRow
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.metrics.recall import average_recall
-from pipeline.scoring import Scorer, truth_digest
+from pipeline.scoring import Scorer, ScoringResult, truth_digest
 
 
 def opened(root, name: str, models: str = "models_eval") -> Dataset:
@@ -28,24 +31,33 @@ def true_rows(scorer: Scorer, *, symmetry: int | None = None) -> list[ResultRow]
     return rows
 
 
-@pytest.mark.parametrize("symmetry", [None, 1, 17])
-@pytest.mark.parametrize("name", ["lmo", "ycbv"])
-def test_ground_truth_scores_one_also_when_rotated_by_a_symmetry(bop_mini, name, symmetry):
-    data = opened(bop_mini / name, name)
-    scorer = Scorer(data, data.targets, "models_eval")
-    recall = average_recall(scorer.score(true_rows(scorer, symmetry=symmetry)).scores)
+@pytest.fixture(scope="module")
+def scorers(bop_mini) -> dict[str, Scorer]:
+    """Scorers of all targets of the photographs."""
+    data = {name: opened(bop_mini / name, name) for name in ("lmo", "ycbv")}
+    return {name: Scorer(dataset, dataset.targets, "models_eval") for name, dataset in data.items()}
+
+
+@pytest.fixture(scope="module")
+def score_truth(scorers) -> Callable[..., ScoringResult]:
+    """Scores of a dataset's ground truth, computed once."""
+    return cache(lambda name, symmetry: scorers[name].score(true_rows(scorers[name], symmetry=symmetry)))
+
+
+@pytest.mark.parametrize(("name", "symmetry"), [("lmo", None), ("lmo", 1), ("ycbv", None), ("ycbv", 1), ("ycbv", 17)])
+def test_ground_truth_scores_one_also_when_rotated_by_a_symmetry(score_truth, name, symmetry):
+    recall = average_recall(score_truth(name, symmetry).scores)
     assert (recall.mssd, recall.mspd) == (1.0, 1.0)
     if name == "ycbv":
         assert recall.vsd == recall.ar == 1.0
 
 
-def test_without_all_depth_images_vsd_is_left_out_with_the_reason(bop_mini):
-    data = opened(bop_mini / "lmo", "lmo")
-    scorer = Scorer(data, data.targets, "models_eval")
-    scored = scorer.score(true_rows(scorer))
+def test_without_all_depth_images_vsd_is_left_out_with_the_reason(bop_mini, score_truth):
+    scored = score_truth("lmo", None)
     assert scored.scores.vsd is None
     assert scored.scores.no_vsd.startswith("39 of 40 images have no depth image")
     assert average_recall(scored.scores).ar is None
+    data = opened(bop_mini / "lmo", "lmo")
     only = tuple(t for t in data.targets if t.im_id == 3)
     with_depth = Scorer(data, only, "models_eval")
     assert average_recall(with_depth.score(true_rows(with_depth)).scores).vsd == 1.0
