@@ -20,6 +20,7 @@ from pipeline.items.views import Image
 from pipeline.report.overlay_labels import INK, ROLE_COLOURS, Colour, Role, write_labels
 from pipeline.stages.render.raycast import render_depth
 
+Line = Float[np.ndarray, "_m 2"]
 _NEAR_MM = 10.0  # edges are clipped where they come closer to the camera plane
 _FAR_PX = 1e6  # fixed-point drawing coordinates overflow beyond this
 _SUBPIXEL_BITS = 4
@@ -117,7 +118,7 @@ def _labels(items: Sequence[DrawnPose], K: Float[np.ndarray, "3 3"]) -> list[tup
     return labels
 
 
-def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> list[Float[np.ndarray, "_m 2"]]:
+def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> list[Line]:
     """Closed outlines (and holes) of the silhouette, pixels, smoothed over five contour points."""
     if transform(item.T_cam_obj, _corners(item.mesh))[:, 2].max() < _NEAR_MM:
         return []
@@ -127,7 +128,7 @@ def _outlines(item: DrawnPose, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, 
     return [_smooth(contour) - margin for contour in _contours(depth > 0)]
 
 
-def _contours(mask: Bool[np.ndarray, "H W"]) -> list[Float[np.ndarray, "_m 2"]]:
+def _contours(mask: Bool[np.ndarray, "H W"]) -> list[Line]:
     found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     return [contour[:, 0].astype(np.float64) for contour in found if len(contour) >= 16]
 
@@ -137,9 +138,7 @@ def _smooth(contour: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m+1 2"]:
     return np.concatenate([mean, mean[:1]])
 
 
-def _draw_lines(
-    canvas: UInt8[np.ndarray, "H W 3"], lines: Sequence[Float[np.ndarray, "_m 2"]], colour: Colour, thickness: int
-) -> None:
+def _draw_lines(canvas: UInt8[np.ndarray, "H W 3"], lines: Sequence[Line], colour: Colour, thickness: int) -> None:
     """Draw lines onto the canvas, anti-aliased, with a thin dark border so that they show on bright backgrounds."""
     fixed = [np.round(px * (1 << _SUBPIXEL_BITS)).astype(np.int32) for px in lines if np.abs(px).max() < _FAR_PX]
     for ink, width in ((INK, thickness + 1), (colour, thickness)):
