@@ -1,4 +1,7 @@
-"""COCO run-length encoding (RLE) of masks: column-major runs, background first, as a list or a compressed string."""
+"""COCO's encodings of masks: polygons, and run-length encoding (RLE) as a list or a compressed string.
+
+Runs are column-major, background first.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 from pycocotools import mask as coco
+
+from pipeline.bop.jsonio import is_number
 
 
 def encode_rle(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
@@ -18,6 +23,47 @@ def encode_rle(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
 def decode_rle(rle: dict[str, Any]) -> Bool[np.ndarray, "H W"]:
     """The mask of an RLE made by ``encode_rle`` or ``read_rle``; the input is not checked."""
     return coco.decode(rle).astype(bool)
+
+
+def read_segmentation(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any] | None:
+    """The mask of an entry as ``encode_rle`` returns it: from an RLE or polygons; None for null and an empty list.
+
+    Raises ValueError, in one line, for anything else.
+    """
+    if segmentation is None or segmentation == []:
+        return None
+    return draw_polygons(segmentation, size_hw) if isinstance(segmentation, list) else read_rle(segmentation, size_hw)
+
+
+def draw_polygons(polygons: list[Any], size_hw: tuple[int, int]) -> dict[str, Any]:
+    """The union of COCO's polygons, as ``encode_rle`` returns it.
+
+    Each polygon is a list [x, y, x, y, ...] in pixels. A single polygon may be such a list itself, or a list of points
+    [[x, y], ...]. Raises ValueError for anything else, and for corners that are parts of the image's size.
+    """
+    if all(is_number(value) for value in polygons):
+        polygons = [polygons]
+    elif all(isinstance(point, list) and len(point) == 2 for point in polygons):
+        polygons = [[value for point in polygons for value in point]]
+    arrays = [_parse_polygon(polygon, size_hw) for polygon in polygons]
+    if all(((array >= 0) & (array <= 1)).all() for array in arrays):
+        raise ValueError("polygons have corners from 0 to 1, not in pixels")
+    edges = sum(float(np.abs(np.diff(array.reshape(-1, 2), axis=0)).sum()) for array in arrays)
+    if edges > 4 * size_hw[0] * size_hw[1]:  # pycocotools allocates memory for every pixel of every edge
+        raise ValueError(f"polygons have edges of {edges:.3g} pixels in total, too many for the image")
+    rle = coco.merge(coco.frPyObjects([array.tolist() for array in arrays], *size_hw))
+    return encode_rle(coco.decode(rle).astype(bool))
+
+
+def _parse_polygon(polygon: Any, size_hw: tuple[int, int]) -> np.ndarray:
+    if not isinstance(polygon, list) or not all(is_number(value) for value in polygon):
+        raise ValueError("segmentation is neither an RLE with size and counts nor polygons [[x, y, x, y, ...], ...]")
+    if len(polygon) < 6 or len(polygon) % 2:
+        raise ValueError(f"polygon has {len(polygon)} numbers, not x and y of three or more corners")
+    array, longer = np.array(polygon, dtype=np.float64), max(size_hw)
+    if not (np.abs(array) <= 2 * longer).all():  # also false for what is not finite
+        raise ValueError(f"polygon has corners far outside the image of {size_hw[1]} x {size_hw[0]} (width x height)")
+    return array
 
 
 def read_rle(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
@@ -49,6 +95,12 @@ def to_uncompressed(rle: dict[str, Any]) -> dict[str, Any]:
 def rle_area(rle: dict[str, Any]) -> int:
     """Number of pixels in the mask. ``rle``: from ``encode_rle`` or ``read_rle``."""
     return int(coco.area(rle))
+
+
+def rle_bbox(rle: dict[str, Any]) -> tuple[float, float, float, float]:
+    """Box (x, y, width, height) around the mask; zeros for an empty mask. ``rle``: as for ``rle_area``."""
+    x, y, w, h = (float(value) for value in coco.toBbox(rle))
+    return x, y, w, h
 
 
 def _runs_to_mask(runs: list[int], h: int, w: int) -> Bool[np.ndarray, "H W"]:

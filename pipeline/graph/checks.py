@@ -43,11 +43,11 @@ def check_layers(stages: Stages) -> None:
 
 
 def detection_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
-    """One line per suspicious camera, then one per suspicious detection.
+    """Warnings of the detector, then one line per suspicious camera, then one per suspicious detection.
 
     Cameras are checked only without ground truth: annotated poses show that a camera is right.
     """
-    warnings = []
+    warnings = context.stages.detect.warnings(context.dataset, context.targets)
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):

@@ -122,7 +122,7 @@ def test_best_scored_detections_of_a_target_are_kept(detected, keep: object, sco
 
 def test_detections_without_a_target_are_ignored(detected: Callable[..., list[Detection]]):
     others = [entry(image_id=999), entry(category_id=77), entry(scene_id=1, segmentation="broken")]
-    assert detected(*others) == []
+    assert detected(*others, entry()) == detected(entry())
 
 
 def test_box_without_a_mask_is_a_detection(detected: Callable[..., list[Detection]]):
@@ -151,7 +151,10 @@ def test_mask_without_a_box_gets_the_box_of_its_pixels(detected: Callable[..., l
         ({"segmentation": {"size": [64, 48], "counts": [AREA]}}, "mask of [64, 48] where the image is [48, 64]"),
         ({"segmentation": {"size": list(SIZE_HW), "counts": [AREA]}}, "mask is empty"),
         ({"segmentation": {"size": list(SIZE_HW), "counts": [AREA - 1]}}, f"cover {AREA - 1} pixels"),
-        ({"segmentation": [[1, 2, 3, 4, 5, 6]]}, "not an RLE"),
+        ({"segmentation": "rle"}, "not an RLE"),
+        ({"segmentation": [[1, 2, 3, 4, 5]]}, "polygon has 5 numbers"),
+        ({"segmentation": [[0.1, 0.1, 0.9, 0.1, 0.9, 0.8]]}, "not in pixels"),
+        ({"segmentation": [[1, 2, 3, 4, 1e300, 6]]}, "far outside the image"),
     ],
 )
 def test_one_bad_detection_is_recorded_and_the_others_are_kept(detected, changes: dict[str, Any], part: str):
@@ -213,8 +216,16 @@ def test_sources_are_the_files_that_detections_depend_on(tiny: Dataset, tmp_path
         ('{"annotations": []}', ["a list of detections"]),
         ("[3]", ["detection 0", "scene_id"]),
         ('[{"scene_id": 7, "image_id": 3}]', ["detection 0", "category_id"]),
-        ('[{"scene_id": 7, "image_id": "3", "category_id": 2}]', ["detection 0", "image_id", "integer"]),
-        ('[{"scene_id": 7, "image_id": 3, "category_id": 2}]', ["detection 0", "score"]),
+        ('[{"scene_id": 7, "image_id": "3a", "category_id": 2, "bbox": []}]', ["detection 0", "image_id", "integer"]),
+        ('[{"score": 1}, {"scene_id": 7, "image_id": 3, "category_id": 2, "bbox": []}]', ["detection 0", "scene_id"]),
+        (
+            '[{"scene_id": 7, "image_id": 3, "category_id": 2, "bbox": [], "score": 1},'
+            ' {"scene_id": 7, "image_id": 3, "category_id": 2, "bbox": []}]',
+            ["detection 1", "score"],
+        ),
+        ('{"detections": [], "model": "x"}', ["the fields detections, model", "COCO annotation file"]),
+        ('{"images": [], "categories": []}', ["field annotations", "images, categories"]),
+        ('{"images": [{"id": [1]}], "annotations": []}', ["image 0, field id", "integer"]),
         ('[{"scene_id": 7, "image_id": 3, "category_id": 2, "score": 1}]', ["detection 0", "bbox"]),
     ],
 )

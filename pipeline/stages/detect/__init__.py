@@ -55,6 +55,10 @@ class Detector(Spec, ABC):
         """Files whose bytes determine the detections; they enter the key."""
         return []
 
+    def warnings(self, dataset: Dataset, targets: Sequence[Target]) -> list[str]:
+        """Results of sanity checks on the sources, one line each; also made when the detections are cached."""
+        return []
+
     @abstractmethod
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None

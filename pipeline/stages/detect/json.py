@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_integer, is_number, read_json
-from pipeline.bop.masks import decode_rle, read_rle, rle_area
+from pipeline.bop.detection_checks import check_boxes_and_masks, check_ids
+from pipeline.bop.detections import Entry, read_entries
+from pipeline.bop.jsonio import abbreviate, is_number
+from pipeline.bop.masks import decode_rle, read_segmentation, rle_area
 from pipeline.bop.scene import Box, xyxy_from_xywh
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
@@ -25,15 +27,17 @@ from pipeline.stages.detect.annotated import image_paths
 class Json(Detector):
     """Detections in the JSON format of BOP's and CNOS's default detections, plain or gzipped.
 
-    A list of {scene_id, image_id, category_id, score, bbox [x, y, w, h], time, segmentation {size, counts}}; ``time``
-    and ``segmentation`` may be missing. Only entries of the targets' images and objects are read.
+    A list of {scene_id, image_id, category_id, score, bbox [x, y, w, h], time, segmentation}; ``time`` and
+    ``segmentation`` (RLE {size, counts} or polygons [[x, y, ...], ...]) may be missing. A COCO annotation file is read
+    too. Only entries of the targets' images and objects are read. Ids, boxes and masks are checked against each other,
+    the images and the targets: see ``bop/detection_checks.py``.
 
     ``keep``: how many detections of a target are kept, best score first: the target's "inst_count", a number, or "all".
     Entries that cannot be used (``defect`` says why) only fill up what usable ones leave open.
     """
 
     kind: ClassVar[str] = "detect.json"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     path: str = ""
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
@@ -49,13 +53,32 @@ class Json(Detector):
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
     ) -> list[Detection]:
-        """The kept detections of each target, best score first. Raises BadInput for a file in another format."""
-        entries = _group_by_target(self._file())
+        """The kept detections of each target, best score first.
+
+        Raises BadInput for a file in another format, or one that fits neither targets nor images.
+        """
+        entries, _ = self._read(dataset, targets)
+        by_target: dict[tuple[int, int, int], list[dict[str, Any]]] = defaultdict(list)
+        for entry in entries:
+            by_target[entry.target].append(entry.record)
         return [
             detection
             for target in targets
-            for detection in self._select(dataset, target, entries[target.scene_id, target.im_id, target.obj_id])
+            for detection in self._select(dataset, target, by_target[target.scene_id, target.im_id, target.obj_id])
         ]
+
+    def warnings(self, dataset: Dataset, targets: Sequence[Target]) -> list[str]:
+        """Results of the checks on the whole file."""
+        return self._read(dataset, targets)[1]
+
+    def _read(self, dataset: Dataset, targets: Sequence[Target]) -> tuple[list[Entry], list[str]]:
+        """Entries of the targets, and warnings. Ids are compared with all targets of the dataset, selected or not."""
+        path = self._file()
+        entries, warnings = read_entries(path, dataset.targets)
+        warnings += check_ids(path, entries, dataset.targets)
+        asked = {(target.scene_id, target.im_id, target.obj_id) for target in targets}
+        entries = [entry for entry in entries if entry.target in asked]
+        return entries, warnings + check_boxes_and_masks(path, entries, dataset.image_size)
 
     def _file(self) -> Path:
         if not self.path:
@@ -77,21 +100,6 @@ class Json(Detector):
         return (usable + broken)[:count]
 
 
-def _group_by_target(path: Path) -> dict[tuple[int, int, int], list[dict[str, Any]]]:
-    entries = read_json(path)
-    if not isinstance(entries, list):
-        raise BadInput(path, found=f"a JSON {type(entries).__name__}", needed="a list of detections")
-    by_target: dict[tuple[int, int, int], list[dict[str, Any]]] = defaultdict(list)
-    for index, entry in enumerate(entries):
-        where = describe_place(path, detection=index)
-        scene_id, im_id, obj_id = (get_integer(entry, name, where) for name in ("scene_id", "image_id", "category_id"))
-        get_field(entry, "score", where)
-        if "segmentation" not in entry:
-            get_field(entry, "bbox", where)
-        by_target[scene_id, im_id, obj_id].append(entry)
-    return by_target
-
-
 def _read_detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, int]) -> Detection:
     ids = target.scene_id, target.im_id, target.obj_id
     score, time = _read_score(entry), entry.get("time", -1.0)
@@ -99,16 +107,16 @@ def _read_detection(entry: dict[str, Any], target: Target, size_hw: tuple[int, i
     try:
         if not math.isfinite(score):
             raise ValueError(f"score is {abbreviate(entry['score'])}, not a finite number")
-        rle = None if entry.get("segmentation") is None else _read_mask(entry["segmentation"], size_hw)
+        rle = _read_mask(entry.get("segmentation"), size_hw)
         box = _read_box(entry.get("bbox"), rle, size_hw)
     except ValueError as error:
         return Detection(*ids, score if math.isfinite(score) else 0.0, time_s, (0.0,) * 4, defect=str(error))
     return Detection(*ids, score, time_s, box, rle)
 
 
-def _read_mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any]:
-    rle = read_rle(segmentation, size_hw)
-    if not rle_area(rle):
+def _read_mask(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any] | None:
+    rle = read_segmentation(segmentation, size_hw)
+    if rle is not None and not rle_area(rle):
         raise ValueError("mask is empty")
     return rle
 
