@@ -21,6 +21,7 @@ from benchmarks.online import online
 from benchmarks.rendering import rendering
 from benchmarks.storing import storing
 from pipeline.io.files import write_json
+from pipeline.parallel import use_threads
 
 PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "online": online,
@@ -47,7 +48,8 @@ def main() -> None:
     args = parser.parse_args()
     if unknown := sorted(set(args.parts) - set(PARTS)):
         parser.error(f"parts: found {', '.join(unknown)}, needs some of {', '.join(PARTS)}")
-    threadpool_limits(args.threads)  # of BLAS in numpy, SciPy and scikit-learn
+    use_threads(args.threads)
+    threadpool_limits(args.threads)  # of BLAS in what is measured besides: numpy, SciPy and scikit-learn
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(args.threads)
     description = describe_machine(args.device)

@@ -65,7 +65,7 @@ def _bare(backbone: DiffusionBackbone, images: int) -> None:
     like: dict[str, Any] = {"device": model.prompt.device, "dtype": model.prompt.dtype}
     vae: Any = model.vae
     unet: Any = model.unet
-    step = min(images, backbone.batch)
+    step = min(images, backbone.passes.size)
     deepest = unet.up_blocks[3].resnets[2]
     stop = deepest.register_forward_pre_hook(_reached)
     try:

@@ -21,8 +21,9 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from pipeline.errors import BadInput, DzopError
-from pipeline.graph import Context, Counts, Graph, use_threads
+from pipeline.graph import Context, Counts, Graph
 from pipeline.io.digests import track_files, tracked_digests
+from pipeline.parallel import use_threads
 from pipeline.spec import NonNegative, Positive, Runtime, spec
 from pipeline.store import MemoryStoreConfig, Store
 

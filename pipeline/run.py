@@ -13,7 +13,7 @@ import torch
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.results import results_name
 from pipeline.errors import BadInput
-from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, plan_costs, plan_table, use_threads
+from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, plan_costs, plan_table
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.io.digests import DigestCache, track_files
 from pipeline.items.poses import NoEstimate
@@ -24,6 +24,7 @@ from pipeline.outputs.files import errors_by_answer, places_text, write_computed
 from pipeline.outputs.folder import OutputFolder
 from pipeline.outputs.pictures import Pictures
 from pipeline.outputs.records import write_record
+from pipeline.parallel import use_threads
 from pipeline.progress import Progress
 from pipeline.report.run_records import read_run_records
 from pipeline.report.scores import scores_table

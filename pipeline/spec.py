@@ -169,7 +169,11 @@ def _count_values(count: int) -> str:
 class Runtime:
     """How to compute. Never part of a key, because it must not change results.
 
-    ``device``: "auto", "cpu", "cuda" or "cuda:N". ``batch``: images per backbone pass, 0 = as many as fit in memory.
+    On the CPU of one machine with one set of library versions, the bytes of every entry are the same whatever
+    ``batch``, threads and number of workers. On a GPU, ``batch`` may change the last digits of features.
+
+    ``device``: "auto", "cpu", "cuda" or "cuda:N". ``batch``: images that a backbone gets at a time, 0 = as many as fit
+    in memory; on the CPU rounded up to whole passes, whose size the model decides.
     ``max_vram`` and ``max_memory``: the most GPU memory and main memory the run may use, such as 8GiB, None = all
     that is free.
     """

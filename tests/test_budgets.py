@@ -120,18 +120,20 @@ def test_a_run_that_exceeds_its_budget_is_refused_before_it_computes_anything(dz
     bank.check(200, "runtime.max_memory", "200B")
 
 
-def test_the_batch_size_follows_the_budget():
+def test_the_batch_size_follows_the_budget(monkeypatch):
     cpu, footprint = (
         torch.device("cpu"),
-        Footprint(weight_bytes=0, bytes_per_pass=5 << 20, bytes_per_crop=10 << 20, max_batch=16),
+        Footprint(weight_bytes=0, bytes_per_pass=5 << 20, bytes_per_crop=10 << 20, max_batch=16, cpu_pass=2),
     )
     taken = psutil.Process().memory_info().rss
     sizes = []
+    monkeypatch.setattr("pipeline.backbones.batching.worker_count", lambda: 4)
     for room in (0, 60 << 20, 1 << 40):
         budget = int((taken + room) / 0.9)  # a tenth stays free
         sizes.append(compute_batch_size(footprint, Runtime(max_memory=f"{budget // 1000}kB"), cpu))
-    assert sizes[0] == 1 < sizes[1] <= 6 < sizes[2] <= 16
-    assert compute_batch_size(footprint, Runtime(), cpu, ahead=1 << 50) == 1
+    assert sizes[0] == 2 < sizes[1] == 4 < sizes[2] == 8  # whole passes of 2, at most one for each thread
+    assert compute_batch_size(footprint, Runtime(), cpu, ahead=1 << 50) == 2
+    assert [compute_batch_size(footprint, Runtime(batch=n), cpu) for n in (1, 2, 5)] == [2, 2, 6]
 
 
 PEAK = """

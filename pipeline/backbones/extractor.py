@@ -6,16 +6,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
-from pipeline.backbones.batching import Footprint
+from pipeline.backbones.batching import Footprint, Passes
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, Spec
 
 
 class Backbone(Protocol):
-    """An extractor with its weights in memory. ``batch``: how many crops to pass in one call."""
+    """An extractor with its weights in memory.
 
-    batch: int
+    A call should have ``passes.batch`` crops. ``passes.run`` computes them so that no byte depends on batch or threads.
+    """
+
+    passes: Passes
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32 or the spec's dtype, on the runtime's device."""

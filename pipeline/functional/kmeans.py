@@ -6,14 +6,19 @@ maps of a pair; seeding and Lloyd iterations below take a quarter of that on two
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from jaxtyping import Float32, Int
 from torch import Tensor
 
-_BLOCK = 1 << 14  # points compared with all centres at a time: both maps of a pair fit in one block
+from pipeline.parallel import one_thread_per_kernel, ordered_map
+
+_BLOCK = 1 << 14  # points compared with all centres, or one, at a time: both maps of a pair fit in one block
 
 
+@one_thread_per_kernel()
 def kmeans(
     points: Float32[Tensor, "m c"], *, count: int, seed: int, iterations: int
 ) -> tuple[Int[Tensor, " m"], Float32[Tensor, "k c"]]:
@@ -42,11 +47,11 @@ def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: in
     draws = np.random.default_rng(seed).random(count)
     squared = np.einsum("mc,mc->m", points, points)
     nearest = np.full(len(points), np.inf, dtype=np.float32)
+    blocks = [slice(first, first + _BLOCK) for first in range(0, len(points), _BLOCK)]
     chosen = [min(int(draws[0] * len(points)), len(points) - 1)]
     for draw in draws[1:]:
         i = chosen[-1]
-        distance = squared + squared[i] - 2 * (points @ points[i])
-        nearest = np.minimum(nearest, np.where(distance > 1e-6 * squared[i], distance, 0))  # rounding errors become 0
+        nearest = np.concatenate(list(ordered_map(partial(_nearest_seed, points, squared, nearest, i), blocks)))
         cumulative = np.cumsum(nearest, dtype=np.float64)
         if cumulative[-1] <= 0:
             break
@@ -55,10 +60,20 @@ def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: in
     return np.array(chosen)
 
 
+def _nearest_seed(points: np.ndarray, squared: np.ndarray, nearest: np.ndarray, i: int, rows: slice) -> np.ndarray:
+    """Squared distances of some points to the nearest seed, after point ``i`` became one."""
+    distance = squared[rows] + squared[i] - 2 * (points[rows] @ points[i])
+    return np.minimum(nearest[rows], np.where(distance > 1e-6 * squared[i], distance, 0))  # rounding errors become 0
+
+
 def _assign(x: Tensor, centre: Tensor) -> Tensor:
     squared = (centre * centre).sum(1)
-    distance = (torch.addmm(squared, rows, centre.T, alpha=-2) for rows in x.split(_BLOCK))
-    return torch.cat([torch.from_numpy(d.numpy().argmin(1)) for d in distance])  # numpy's argmin is six times as fast
+
+    def nearest(rows: Tensor) -> Tensor:
+        distance = torch.addmm(squared, rows, centre.T, alpha=-2)
+        return torch.from_numpy(distance.numpy().argmin(1))  # numpy's argmin is six times as fast
+
+    return torch.cat(list(ordered_map(nearest, x.split(_BLOCK))))
 
 
 def _update_centres(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:

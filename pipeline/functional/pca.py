@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.parallel import ordered_map
+
 _NEGLIGIBLE = 1e-5  # of the largest variance: smaller ones are rounding errors in a float32 Gram matrix
 
 
@@ -38,9 +40,13 @@ def principal_axes_in_blocks(
     blocks = samples.split(block)
     mean = torch.stack([part.double().sum(0) for part in blocks]).sum(0) / len(samples)
     gram = torch.zeros(len(mean), len(mean), dtype=torch.float64, device=samples.device)
-    for part in blocks:
+
+    def product(part: Tensor) -> Tensor:
         centred = part.double() - mean
-        gram += centred.T @ centred
+        return centred.T @ centred
+
+    for part in ordered_map(product, blocks):
+        gram += part
     _, vectors = _leading_eigenvectors(gram.cpu().numpy(), dim)
     axes = torch.from_numpy(vectors).to(samples.device, torch.float32)
     return mean.float(), _fix_signs(axes)
@@ -51,7 +57,7 @@ def project_onto_axes(
 ) -> Float[Tensor, "m k"]:
     """Coordinates of the samples, minus the mean, along the axes; float32."""
     shift = mean @ axes
-    return torch.cat([part.float() @ axes - shift for part in samples.split(block)])
+    return torch.cat(list(ordered_map(lambda part: part.float() @ axes - shift, samples.split(block))))
 
 
 def _gram_matrix(x: Float[Tensor, "a b"], *, exact: bool) -> np.ndarray:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.functional.similarity import l2_normalize
+from pipeline.parallel import ordered_map
 
 _BLOCK = 1 << 13  # descriptors compared with all words at a time
 
@@ -20,12 +21,14 @@ def nearest_words(
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
     """Squared Euclidean distances to, and indices of, each point's k <= ``count`` nearest words, nearest first."""
     count, lengths = min(count, len(words)), (words * words).sum(1)
-    nearest = [
-        torch.topk(torch.addmm(lengths, block, words.T, alpha=-2), count, largest=False)
-        for block in points.split(_BLOCK)
-    ]
-    index = torch.cat([block.indices for block in nearest])
-    squared = torch.cat([block.values for block in nearest]) + (points * points).sum(1, keepdim=True)
+
+    def nearest(block: Tensor) -> tuple[Tensor, Tensor]:
+        squared, index = torch.topk(torch.addmm(lengths, block, words.T, alpha=-2), count, largest=False)
+        return squared, index
+
+    blocks = list(ordered_map(nearest, points.split(_BLOCK)))
+    index = torch.cat([index for _, index in blocks])
+    squared = torch.cat([squared for squared, _ in blocks]) + (points * points).sum(1, keepdim=True)
     return squared.clamp(min=0), index
 
 

@@ -20,7 +20,7 @@ from pipeline.graph.plan import KEY_DIGITS, Node
 from pipeline.graph.plan_text import plan_costs, plan_table
 from pipeline.graph.replay import Replay
 from pipeline.graph.scores import PoseEvaluation, ScoreNodes
-from pipeline.graph.tasks import Counts, Workers, use_threads
+from pipeline.graph.tasks import Counts, Workers
 
 __all__ = [
     "KEY_DIGITS",
@@ -35,5 +35,4 @@ __all__ = [
     "Workers",
     "plan_costs",
     "plan_table",
-    "use_threads",
 ]

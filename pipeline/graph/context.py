@@ -20,6 +20,7 @@ from pipeline.io.digests import unchanged_files
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Crop, Crops, Target
 from pipeline.method import Stages
+from pipeline.parallel import one_thread_per_kernel
 from pipeline.progress import Progress
 from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
@@ -113,6 +114,7 @@ class Context:
 
     # --- tasks -------------------------------------------------------------------------------------------------------
 
+    @one_thread_per_kernel()
     def run_task(self, task: Task[Item], items: Sequence[Item], advance: Advance) -> None:
         """Run a task for every item, here or in the workers. Items that are complete are never sent to a worker."""
         workers = self.workers
@@ -151,6 +153,7 @@ class Context:
 
     # --- filling -----------------------------------------------------------------------------------------------------
 
+    @one_thread_per_kernel()
     def fill(
         self,
         step: str,
@@ -190,9 +193,9 @@ class Context:
             return {ref.key: {"maps": maps[layer]} for layer, ref in missing.items()}
 
         layouts = {ref: self.features_layout(layer) for layer, ref in missing.items()}
-        batch = self.backbone.batch  # loads the weights now, so that a row's seconds do not include it
+        batch = self.backbone.passes.batch  # loads the weights now, so that a row's seconds do not include it
         timing = timing_key("features", self.stages, list(missing))
-        self.fill(step, title, layouts, rows, self.runtime.batch or batch, compute, timing=timing)
+        self.fill(step, title, layouts, rows, batch, compute, timing=timing)
 
     def maps(self, crops: Crops, layers: Sequence[int]) -> dict[int, np.ndarray]:
         """Feature maps of crops by layer, float16 on the CPU, as they are stored."""

@@ -15,6 +15,7 @@ from pipeline.graph.proposals import ProposalNodes
 from pipeline.io.digests import file_digest
 from pipeline.items.records import detection_from_record, detection_to_record
 from pipeline.items.views import Detection
+from pipeline.parallel import one_thread_per_kernel
 from pipeline.spec import digest
 from pipeline.stages.detect import Descriptors
 from pipeline.store import Ref, make_ref
@@ -66,6 +67,7 @@ class DetectionNodes:
         record = detection_to_record(detection)
         return record | {"time_s": 0.0} if self.proposals else record
 
+    @one_thread_per_kernel()
     def _detect(self) -> list[Detection]:
         descriptors = None if self.proposals is None else self._describe(self.proposals)
         return self.context.stages.detect(self.context.dataset, self.context.targets, descriptors)

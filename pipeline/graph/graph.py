@@ -24,6 +24,7 @@ from pipeline.graph.tasks import Counts, Task
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
+from pipeline.parallel import one_thread_per_kernel
 from pipeline.scoring import Scorer
 
 
@@ -104,6 +105,7 @@ class Graph:
         """Recomputes how an answer came about, from stored features."""
         return Replayer(self.templates, self.queries, self.poses)
 
+    @one_thread_per_kernel()
     def run_item(self, task: str, item: Any) -> Counts:
         """Run one item of the task with this name, in a worker; returns the counts of its steps."""
         tasks: list[Task[Any]] = [self.templates.onboard_task, self.queries.describe_task, self.poses.solve_task]

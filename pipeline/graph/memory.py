@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import psutil
 import torch
 
-from pipeline.backbones.batching import BUDGET_SHARE, compute_batch_size
+from pipeline.backbones.batching import BUDGET_SHARE, bytes_of_batch, compute_batch_size
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.memory_needs import MemoryNeeds, estimate_needs
@@ -80,7 +80,7 @@ def estimate_peak(context: Context, needs: MemoryNeeds, *, minimal: bool = False
     views = 1 if minimal else count_cached_views(context, needs)
     bank = needs.bank + needs.online + views * needs.view
     if needs.rerender and needs.footprint is not None:  # a hypothesis is rendered and encoded while the bank is there
-        bank += needs.rerender + needs.footprint.bytes_per_pass + needs.footprint.bytes_per_crop
+        bank += needs.rerender + bytes_of_batch(needs.footprint, 1, device)
     on_device = {f"{_BATCH} of {batch}": batch_bytes, _BANK: bank} if batch_bytes else {_BANK: bank}
     on_cpu, unknown = {"rendering": needs.render, _FITS: needs.fits}, ", ".join(needs.unknown)
     if device.type == "cpu":
@@ -92,13 +92,13 @@ def estimate_peak(context: Context, needs: MemoryNeeds, *, minimal: bool = False
 
 def _estimate_batch(context: Context, needs: MemoryNeeds, device: torch.device, *, minimal: bool) -> tuple[int, int]:
     """Crops per backbone pass, and bytes of a pass; 0 bytes if nothing passes through a backbone."""
-    batch, footprint = context.runtime.batch or 1, needs.footprint
+    runtime, footprint = context.runtime, needs.footprint
     if footprint is None:
-        return batch, 0
-    if not minimal:
-        batch = context.runtime.batch or compute_batch_size(footprint, context.runtime, device, ahead=needs.weights)
-    batch = min(batch, needs.templates)
-    return batch, footprint.bytes_per_pass + batch * footprint.bytes_per_crop
+        return runtime.batch or 1, 0
+    if minimal:
+        runtime = replace(runtime, batch=runtime.batch or 1)
+    batch = compute_batch_size(footprint, runtime, device, ahead=needs.weights)
+    return min(batch, needs.templates), bytes_of_batch(footprint, min(batch, needs.templates), device)
 
 
 def count_cached_views(context: Context, needs: MemoryNeeds) -> int:

@@ -14,6 +14,7 @@ from pipeline.items.online import Hypothesis
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
+from pipeline.parallel import one_thread_per_kernel
 from pipeline.route import replay_hypothesis
 
 
@@ -35,6 +36,7 @@ class Replayer:
     queries: QueryNodes
     poses: PoseNodes
 
+    @one_thread_per_kernel()
     def __call__(self, answer: Answer) -> Replay | None:
         """The intermediate results of an answer; None where there is no crop to show."""
         if answer.detection_id is None:

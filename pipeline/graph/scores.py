@@ -26,6 +26,7 @@ from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer, errors_from_record, errors_to_record, scores_from_record, scores_to_record
 from pipeline.metrics.correspondence_error import correspondence_errors_mm
 from pipeline.metrics.template_error import template_error
+from pipeline.parallel import one_thread_per_kernel
 from pipeline.scoring import SCORES_VERSION, Scorer, ScoringResult, truth_digest
 from pipeline.spec import digest
 from pipeline.stages.render.raycast import DEPTH_VERSION
@@ -115,6 +116,7 @@ class ScoreNodes:
             correspondences={(s, i, o, g): error for s, i, o, g, error in document.get("correspondences", [])},
         )
 
+    @one_thread_per_kernel()
     def _compute(self, answers: Sequence[Answer]) -> None:
         start = time.perf_counter()
         with self.context.progress.bar(len(self.scorer.images), "scores", "image") as advance:

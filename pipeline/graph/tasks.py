@@ -11,10 +11,6 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-import cv2
-import torch
-from threadpoolctl import threadpool_limits
-
 from pipeline.progress import StepCount
 
 Item = TypeVar("Item", bound=Hashable)
@@ -47,11 +43,3 @@ class Workers(Protocol):
         Raises DzopError with the message of the first item that failed.
         """
         ...
-
-
-def use_threads(threads: int) -> None:
-    """Set the number of CPU threads of this process for torch, OpenCV and BLAS; 0 leaves the defaults."""
-    if threads:
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
-        threadpool_limits(threads)  # the BLAS of SciPy and NumPy has a thread pool of its own

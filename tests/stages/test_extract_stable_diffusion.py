@@ -18,6 +18,7 @@ from pipeline.backbones.stable_diffusion.features import DiffusionBackbone
 from pipeline.errors import BadInput
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
+from pipeline.parallel import worker_count
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
@@ -51,7 +52,7 @@ def loaded(folder: Path, dtype: str = "float32", prompt: str = "") -> DiffusionB
 def features(folder: Path, crops: Crops, layers: Sequence[int], **fields: object) -> FeatureMaps:
     spec = extractor(folder, **fields)
     base = loaded(folder, spec.dtype, spec.prompt)
-    return DiffusionBackbone(spec, base.configs, base.model, batch=4)(crops, layers)
+    return DiffusionBackbone(spec, base.configs, base.model, base.passes)(crops, layers)
 
 
 def some_crops(n: int = 4, size: int = 64) -> Crops:
@@ -235,9 +236,11 @@ def test_a_prompt_changes_the_features(sd1: Path) -> None:
 
 
 def test_batch_size_follows_memory_unless_it_is_given(sd1: Path) -> None:
-    small, large = (extractor(sd1, input_size=s).load(Runtime(device="cpu")).batch for s in (128, 1024))
-    assert small == 16  # more gain nothing on a CPU
-    assert 1 <= large < small
+    small, large = (extractor(sd1, input_size=s).load(Runtime(device="cpu")).passes for s in (128, 1024))
+    assert small.size == 16  # more gain nothing on a CPU
+    assert 1 <= large.size < small.size
+    for passes in (small, large):
+        assert passes.batch in {n * passes.size for n in range(1, worker_count() + 1)}
 
 
 def test_sizes_and_channels_on_the_configuration_of_sd15(tmp_path: Path) -> None:

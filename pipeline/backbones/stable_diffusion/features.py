@@ -6,9 +6,13 @@ latent once, run the U-Net once, read its decoder.
 
 from __future__ import annotations
 
+import copy
+import threading
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,7 +21,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
+from pipeline.backbones.batching import Footprint, Passes, choose_cpu_pass, maps_bytes
 from pipeline.backbones.determinism import use_deterministic_convolutions
 from pipeline.backbones.extractor import Extractor
 from pipeline.backbones.stable_diffusion.decoder import Hook, count_blocks, map_shape, read_decoder_maps
@@ -102,9 +106,8 @@ class DiffusionFeatures(Extractor):
         device = torch.device(runtime.torch_device())
         model = self.load_model()
         placed = LoadedModel(_place(model.unet, device), _place(model.vae, device), model.prompt.to(device))
-        passes = _pass_footprint(self, configs, device.type)
-        batch = runtime.batch or compute_batch_size(passes, runtime, device)
-        return DiffusionBackbone(self, configs, placed, batch)
+        passes = Passes.choose(_pass_footprint(self, configs, device.type), runtime, device)
+        return DiffusionBackbone(self, configs, placed, passes)
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As Extractor.footprint; weights are counted on meta tensors, which take no memory."""
@@ -115,30 +118,42 @@ class DiffusionFeatures(Extractor):
         values = count_parameters(UNet2DConditionModel, self.configs.unet)
         values += count_parameters(AutoencoderKL, self.configs.vae, without="decoder")
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(
-            values * _bytes_per_value(self), passes.bytes_per_pass, passes.bytes_per_crop + maps, passes.max_batch
+        return replace(
+            passes, weight_bytes=values * _bytes_per_value(self), bytes_per_crop=passes.bytes_per_crop + maps
         )
 
 
 class DiffusionBackbone:
     """A DiffusionFeatures spec with its model in memory."""
 
-    def __init__(self, spec: DiffusionFeatures, configs: DiffusionConfigs, model: LoadedModel, batch: int) -> None:
-        self.spec, self.configs, self.model, self.batch = spec, configs, model, batch
+    def __init__(self, spec: DiffusionFeatures, configs: DiffusionConfigs, model: LoadedModel, passes: Passes) -> None:
+        self.spec, self.configs, self.model, self.passes = spec, configs, model, passes
+        self._thread = threading.local()
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        """Maps of the given layers in the spec's dtype, on the model's device, computed ``batch`` crops at a time."""
+        """Maps of the given layers in the spec's dtype, on the model's device."""
+        self.check(layers)
+        with use_deterministic_convolutions():
+            return self.passes.run(partial(self.run_pass, layers=layers), crops, layers)
+
+    def check(self, layers: Sequence[int]) -> None:
+        """Raise BadInput for a layer that the model does not have."""
         _check(self.spec, self.configs, layers)
-        chunks = [self._extract_chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
-        # outside inference mode, so that the result is an ordinary tensor that may be changed in place
-        return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
 
     @torch.inference_mode()
-    def _extract_chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        with use_deterministic_convolutions():
-            latent = self._encode(crops.rgb)
-            members = 1 if self.spec.noise == "none" else self.spec.ensemble
-            return _average([self._extract_maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
+    def run_pass(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of crops that pass the networks together."""
+        latent = self._encode(crops.rgb)
+        members = 1 if self.spec.noise == "none" else self.spec.ensemble
+        return _average([self._extract_maps(crops, latent, self.spec.seed + i, layers) for i in range(members)])
+
+    @property
+    def _unet(self) -> nn.Module:
+        """The U-Net for this thread: the weights are shared, the hooks that read its blocks are not."""
+        if not hasattr(self._thread, "unet"):
+            self._thread.unet = copy_structure(self.model.unet)
+        unet: nn.Module = self._thread.unet
+        return unet
 
     def _encode(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n c h w"]:
         # one by one on the CPU: a batch is no faster there, and the VAE's first maps are the largest of all
@@ -158,7 +173,13 @@ class DiffusionBackbone:
             shape = (latent.shape[1], latent.shape[2], latent.shape[3])
             noise = draw_noise(s.noise, crops.rgb, crops.mask, seed=seed, shape=shape).to(latent)
             latent = add_noise(latent, noise, alpha_cumprod=float(self.configs.alphas_cumprod[s.timestep]))
-        return read_decoder_maps(self.model.unet, latent, s.timestep, self.model.prompt, layers=layers, hook=s.hook)
+        return read_decoder_maps(self._unet, latent, s.timestep, self.model.prompt, layers=layers, hook=s.hook)
+
+
+def copy_structure(model: nn.Module) -> nn.Module:
+    """A copy of a model that shares its tensors."""
+    tensors = chain(model.parameters(), model.buffers())
+    return copy.deepcopy(model, {id(tensor): tensor for tensor in tensors})
 
 
 def to_network_image(rgb: UInt8[Tensor, "n S S 3"], *, size: int) -> Float[Tensor, "n 3 H W"]:
@@ -219,4 +240,5 @@ def _pass_footprint(spec: DiffusionFeatures, configs: DiffusionConfigs, device: 
     vae = 6 * configs.vae["block_out_channels"][0] * spec.input_size**2 * _bytes_per_value(spec)
     if device == "cuda":
         return Footprint(0, 0, unet + vae, _MOST_CROPS[device])
-    return Footprint(0, max(0, vae - unet), unet, _MOST_CROPS[device])
+    bytes_per_pass, max_batch = max(0, vae - unet), _MOST_CROPS[device]
+    return Footprint(0, bytes_per_pass, unet, max_batch, choose_cpu_pass(bytes_per_pass, unet, max_batch))

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,7 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
+from pipeline.backbones.batching import Footprint, Passes, choose_cpu_pass, maps_bytes
 from pipeline.backbones.determinism import use_deterministic_convolutions
 from pipeline.backbones.extractor import Extractor
 from pipeline.backbones.stable_diffusion.features import to_network_image
@@ -114,51 +115,49 @@ class VitFeatures(Extractor):
         _check(self, ())
         device = torch.device(runtime.torch_device())
         model = self.source.load_model(getattr(torch, self.dtype)).eval().requires_grad_(False).to(device)
-        batch = runtime.batch or compute_batch_size(_pass_footprint(self, device.type), runtime, device)
-        return VitBackbone(self, model, device, batch)
+        return VitBackbone(self, model, Passes.choose(_pass_footprint(self, device.type), runtime, device))
 
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As Extractor.footprint; weights are counted from the headers of their files."""
         paths = [path for path in self.source.files.values() if path.suffix == ".safetensors"]
         values = sum(math.prod(shape) for path in paths for shape in tensor_shapes(path).values())
         maps = maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(
-            values * _bytes_per_value(self), 0, _pass_footprint(self, device).bytes_per_crop + maps, _MOST_CROPS[device]
+        passes = _pass_footprint(self, device)
+        return replace(
+            passes, weight_bytes=values * _bytes_per_value(self), bytes_per_crop=passes.bytes_per_crop + maps
         )
 
 
 class VitBackbone:
     """A VitFeatures spec with its model in memory."""
 
-    def __init__(self, spec: VitFeatures, model: nn.Module, device: torch.device, batch: int) -> None:
-        self.spec, self.model, self.device, self.batch = spec, model, device, batch
+    def __init__(self, spec: VitFeatures, model: nn.Module, passes: Passes) -> None:
+        self.spec, self.model, self.passes = spec, model, passes
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        """Maps of the given layers in the spec's dtype, on the model's device, computed ``batch`` crops at a time."""
+        """Maps of the given layers in the spec's dtype, on the model's device."""
         _check(self.spec, layers)
-        chunks = [self._extract_chunk(crops[i : i + self.batch], layers) for i in range(0, len(crops), self.batch)]
-        # outside inference mode, so that the result is an ordinary tensor that may be changed in place
-        return {k: torch.cat([maps[k] for maps in chunks]).contiguous() for k in layers}
+        with use_deterministic_convolutions():
+            return self.passes.run(partial(self._run_pass, layers=layers), crops, layers)
 
     @torch.inference_mode()
-    def _extract_chunk(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+    def _run_pass(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         s = self.spec
-        with use_deterministic_convolutions():
-            found = read_block_tokens(
-                self.model,
-                embed_patches(self.model, self._prepare_image(crops), stride=s.stride_px),
-                layers=layers,
-                facet=s.facet,
-                norm_last=s.norm_last,
-                saliency_heads=_heads(s),
-                skipped=1 + s.sizes.registers,
-            )
-            return {layer: self._to_map(tokens, layer) for layer, tokens in found.items()}
+        found = read_block_tokens(
+            self.model,
+            embed_patches(self.model, self._prepare_image(crops), stride=s.stride_px),
+            layers=layers,
+            facet=s.facet,
+            norm_last=s.norm_last,
+            saliency_heads=_heads(s),
+            skipped=1 + s.sizes.registers,
+        )
+        return {layer: self._to_map(tokens, layer) for layer, tokens in found.items()}
 
     def _prepare_image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
         """The image that patches are cut from: the crops at ``input_size``, padded and standardised."""
         s = self.spec
-        rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.device)
+        rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.passes.device)
         image = (to_network_image(rgb, size=s.input_size) + 1) / 2
         padded = pad_border(image, overhang=s.sizes.patch - s.stride_px)
         return standardise(padded).to(getattr(torch, s.dtype))
@@ -199,4 +198,6 @@ def _pass_footprint(spec: VitFeatures, device: str) -> Footprint:
     """Estimate of a pass from the maps in memory within a block and the widest map that is returned."""
     cells = (spec.input_size // spec.stride_px) ** 2
     maps = _LIVE_MAPS + 2 * len(set(spec.binned)) * bin_count(spec.hierarchy)
-    return Footprint(0, 0, maps * spec.sizes.width * cells * _bytes_per_value(spec), _MOST_CROPS[device])
+    bytes_per_crop = maps * spec.sizes.width * cells * _bytes_per_value(spec)
+    max_batch = _MOST_CROPS[device]
+    return Footprint(0, 0, bytes_per_crop, max_batch, choose_cpu_pass(0, bytes_per_crop, max_batch))

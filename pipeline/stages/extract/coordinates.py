@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from pydantic import Field
 
-from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
+from pipeline.backbones.batching import Footprint, Passes, maps_bytes
 from pipeline.backbones.extractor import Extractor
 from pipeline.backbones.grid import CELLS, count_cells
 from pipeline.errors import BadInput
@@ -20,6 +21,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import NonNegative, PositiveFloat, Runtime, spec
 
 FINEST = max(CELLS.values())
+_CPU_PASS = 4  # crops; the bytes do not depend on it
 
 
 @spec
@@ -50,7 +52,7 @@ class Coordinates(Extractor):
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As Extractor.footprint: the float64 points of a map's cells, and the maps."""
         maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(0, 0, 8 * FINEST**2 * (12 + 2 * self.channels) + maps, max_batch=64)
+        return Footprint(0, 0, 8 * FINEST**2 * (12 + 2 * self.channels) + maps, max_batch=64, cpu_pass=_CPU_PASS)
 
     def load(self, runtime: Runtime) -> CoordinatesBackbone:
         """The spec on the runtime's device; there are no weights."""
@@ -63,11 +65,15 @@ class CoordinatesBackbone:
     def __init__(self, spec: Coordinates, runtime: Runtime) -> None:
         self.device = torch.device(runtime.torch_device())
         footprint = spec.footprint(tuple(CELLS), 0)
-        self.batch = runtime.batch or compute_batch_size(footprint, runtime, self.device)
+        self.passes = Passes.choose(footprint, runtime, self.device)
         self.spec = spec
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32. Raises BadInput for crops without geometry."""
+        run_pass = partial(self._run_pass, layers=layers)
+        return self.passes.run(run_pass, crops, layers)
+
+    def _run_pass(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         views = [cell_points(crops, i, cells=FINEST) for i in range(len(crops))]
         return {layer: torch.from_numpy(self._compute_maps(views, layer)).to(self.device) for layer in layers}
 

@@ -82,7 +82,7 @@ class Embedded(DiffusionFeatures):
     def load(self, runtime: Runtime) -> EmbeddedBackbone:
         """As DiffusionFeatures.load."""
         decoder = super().load(runtime)
-        return EmbeddedBackbone(self, decoder.configs, decoder.model, decoder.batch)
+        return EmbeddedBackbone(self, decoder.configs, decoder.model, decoder.passes)
 
     def recipe(self) -> dict[str, Any]:
         """As DiffusionFeatures.recipe, with the weights' digest after the name of the set."""
@@ -117,14 +117,16 @@ class Embedded(DiffusionFeatures):
 class EmbeddedBackbone(DiffusionBackbone):
     """The model in memory, with gradient histograms as an additional layer."""
 
-    def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
-        """Maps of the given layers, in the spec's dtype, on the model's device."""
+    def check(self, layers: Sequence[int]) -> None:
+        """Raise BadInput for a layer that neither the model nor the histograms have."""
+        super().check(_decoder_layers(layers))
+
+    @torch.inference_mode()
+    def run_pass(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        """Maps of crops that pass the networks together, and their histograms."""
         decoder_layers = _decoder_layers(layers)
-        maps = super().__call__(crops, decoder_layers) if decoder_layers else {}
-        if EDGES in layers:
-            chunks = [self._compute_edges(crops[i : i + self.batch]) for i in range(0, len(crops), self.batch)]
-            maps = {**maps, EDGES: torch.cat(chunks)}
-        return maps
+        maps = super().run_pass(crops, decoder_layers) if decoder_layers else {}
+        return {**maps, EDGES: self._compute_edges(crops)} if EDGES in layers else maps
 
     def _compute_edges(self, crops: Crops) -> Float[Tensor, "n 8 h w"]:
         device = self.model.prompt.device

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import field
+from functools import partial
 from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, PlainValidator
 
-from pipeline.backbones.batching import Footprint, maps_bytes
+from pipeline.backbones.batching import Footprint, Passes, maps_bytes
 from pipeline.backbones.extractor import Backbone, Extractor
 from pipeline.errors import BadInput
 from pipeline.functional.maps import concatenate_normalized
@@ -129,6 +130,7 @@ class Fusion(Extractor):
             bytes_per_pass=max(first.bytes_per_pass, second.bytes_per_pass),
             bytes_per_crop=max(first.bytes_per_crop, second.bytes_per_crop) + maps,
             max_batch=min(first.max_batch, second.max_batch),
+            cpu_pass=min(first.cpu_pass, second.cpu_pass),
         )
 
     def load(self, runtime: Runtime) -> FusionBackbone:
@@ -145,12 +147,17 @@ class FusionBackbone:
 
     def __init__(self, spec: Fusion, first: Backbone, second: Backbone) -> None:
         self.spec, self.first, self.second = spec, first, second
-        self.batch = min(first.batch, second.batch)
+        size = min(first.passes.size, second.passes.size)
+        batch = min(first.passes.batch, second.passes.batch)
+        self.passes = Passes(first.passes.device, max(1, batch // size) * size, size)
 
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32."""
         for layer in layers:
             self.spec.feature_shape(layer)
+        return self.passes.run(partial(self._run_pass, layers=layers), crops, layers)
+
+    def _run_pass(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         partner = {layer: self.spec.partner(layer) for layer in layers}
         first = self.first(crops, tuple(partner))
         second = self.second(crops, tuple(sorted(set(partner.values()))))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.backbones.batching import Footprint, compute_batch_size, maps_bytes
+from pipeline.backbones.batching import Footprint, Passes, maps_bytes
 from pipeline.backbones.extractor import Extractor
 from pipeline.backbones.grid import CELLS, count_cells
 from pipeline.functional.gradients import append_neighbours, cell_means, oriented_energy, smooth_histograms
@@ -19,6 +20,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import Fraction, NonNegative, Positive, PositiveFloat, Runtime, spec
 
 _CROP_PX = 256  # a batch is sized for crops of this side
+_CPU_PASS = 4  # crops; the bytes do not depend on it
 
 
 @spec
@@ -52,7 +54,7 @@ class Hog(Extractor):
     def footprint(self, layers: Sequence[int], crop_size: int, device: str = "cpu") -> Footprint:
         """As Extractor.footprint: gradients of three channels, energies by orientation, and maps with their context."""
         maps = 2 * maps_bytes([self.feature_shape(layer) for layer in layers])
-        return Footprint(0, 0, 4 * (28 + 3 * self.orientations) * crop_size**2 + maps, max_batch=32)
+        return Footprint(0, 0, 4 * (28 + 3 * self.orientations) * crop_size**2 + maps, max_batch=32, cpu_pass=_CPU_PASS)
 
     def load(self, runtime: Runtime) -> HogBackbone:
         """The spec on the runtime's device; there are no weights."""
@@ -65,12 +67,15 @@ class HogBackbone:
     def __init__(self, spec: Hog, runtime: Runtime) -> None:
         self.spec, self.device = spec, torch.device(runtime.torch_device())
         footprint = spec.footprint(tuple(CELLS), _CROP_PX)
-        self.batch = runtime.batch or compute_batch_size(footprint, runtime, self.device)
+        self.passes = Passes.choose(footprint, runtime, self.device)
 
-    @torch.no_grad()
     def __call__(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
         """Maps of the given layers, float32."""
-        cells = {layer: count_cells(layer) for layer in layers}
+        run_pass = partial(self._run_pass, cells={layer: count_cells(layer) for layer in layers})
+        return self.passes.run(run_pass, crops, layers)
+
+    @torch.no_grad()
+    def _run_pass(self, crops: Crops, cells: Mapping[int, int]) -> FeatureMaps:
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(self.device) for x in (crops.rgb, crops.mask))
         s = self.spec
         energy = oriented_energy(rgb, mask, orientations=s.orientations, signed=s.signed, silhouette=s.silhouette)

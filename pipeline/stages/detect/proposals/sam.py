@@ -84,10 +84,15 @@ class Sam(Proposer):
 
 
 class LoadedSam:
-    """SAM or SAM 2 in memory. ``batch``: points per pass of the mask decoder; 0 for the usual 64."""
+    """SAM or SAM 2 in memory.
+
+    ``batch``: points per pass of the mask decoder on a GPU, 0 for the usual 64; always 64 on the CPU, so that no byte
+    depends on it.
+    """
 
     def __init__(self, spec: Sam, model: Any, batch: int = 0) -> None:
-        self.spec, self.model, self.batch = spec, model, batch or POINTS_PER_BATCH
+        self.spec, self.model = spec, model
+        self.batch = POINTS_PER_BATCH if model.device.type == "cpu" else batch or POINTS_PER_BATCH
         self.side = int(model.config.prompt_encoder_config.image_size)
         self.resizes_to_square = model.config.model_type != "sam"  # SAM 2; SAM pads instead
 

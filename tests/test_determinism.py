@@ -1,0 +1,135 @@
+"""On the CPU, the bytes of every entry depend neither on the batch, nor on threads, nor on the number of processes."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.parallel import one_thread_per_kernel, ordered_map, use_threads, worker_count
+from pipeline.store import LocalStoreConfig, Store
+from pipeline.synthetic.scenes import write_dataset
+from tests.command import run_dzop
+from tests.same_bytes import contents, poses
+
+ROOT = Path(__file__).parents[1]
+QUIET = ("overlays=false", "gallery=0", "runtime.progress=false", "runtime.device=cpu", "evaluate.vsd=false")
+METHODS = {
+    "dzop": ("method=dzop", "extract=embedded"),
+    "dzop_x": ("method=dzop_x", "extract=embedded"),
+    "words": ("method=dzop", "extract=embedded", "match=words", "match.count=200", "match.dim=32"),
+}
+SETTINGS = [("runtime.batch=1", "threads=2"), ("runtime.batch=4", "threads=1"), ("runtime.batch=16", "threads=2")]
+
+
+@pytest.fixture(autouse=True)
+def default_threads():
+    yield
+    use_threads(0)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("synthetic") / "scene"
+    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
+    return root
+
+
+@pytest.fixture
+def results(capsys, monkeypatch, tmp_path) -> Callable[..., dict[str, object]]:
+    """Runs the command in a store of its own; every entry's bytes and the results csv."""
+
+    def run(name: str, *arguments: str) -> dict[str, object]:
+        folder = tmp_path / name
+        places = (f"store.root={folder}/cache", f"out={folder}/out")
+        ran = run_dzop(capsys, monkeypatch, *places, *QUIET, *arguments)
+        assert ran.status == 0, ran.err
+        return contents(Store(LocalStoreConfig(root=f"{folder}/cache"))) | {"csv": poses(folder / "out")}
+
+    return run
+
+
+def differences(a: dict[str, object], b: dict[str, object]) -> list[str]:
+    return sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_bytes_of_entries_depend_neither_on_batch_nor_on_threads(results, scene, method):
+    data = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", "render.count=12", "render.size=96")
+    first = results("first", *data, *METHODS[method], "runtime.batch=3", "threads=1")
+    again = results("again", *data, *METHODS[method], "runtime.batch=16", "threads=2")
+    assert differences(first, again) == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize("method", METHODS)
+def test_bytes_on_photographs_depend_neither_on_batch_nor_on_threads_nor_on_processes(
+    results, bop_mini, tmp_path, method
+):
+    data = ("dataset=lmo", f"dataset.root={bop_mini}/lmo", "select.images=[3,36,92]", "render.count=40")
+    first = results("first", *data, *METHODS[method], "threads=1")
+    assert len(first["csv"].splitlines()) > 20
+    for n, setting in enumerate(SETTINGS):
+        assert differences(first, results(str(n), *data, *METHODS[method], *setting)) == []
+    places = (f"store.root={tmp_path}/shared/cache", *QUIET, *data, *METHODS[method])
+    command = [sys.executable, "-m", "pipeline", *places, "step=estimate"]
+    started = [subprocess.Popen([*command, f"out={tmp_path}/shared/{n}", f"threads={n}"], cwd=ROOT) for n in (1, 2)]
+    assert [process.wait(1200) for process in started] == [0, 0]
+    together = results("shared", *data, *METHODS[method])
+    assert differences(first, together) == []
+
+
+def test_results_of_parallel_items_come_in_order_and_kernels_run_on_one_thread():
+    use_threads(3)
+    seen = list(ordered_map(lambda n: (n, torch.get_num_threads(), worker_count()), range(20)))
+    assert seen == [(n, 1, 1) for n in range(20)]
+    assert worker_count() == 3
+
+
+def test_the_first_error_of_parallel_items_is_raised():
+    def fail(n: int) -> int:
+        if n > 4:
+            raise ValueError(n)
+        return n
+
+    use_threads(2)
+    with pytest.raises(ValueError, match="5"):
+        list(ordered_map(fail, range(20)))
+    assert list(ordered_map(fail, range(4))) == [0, 1, 2, 3]
+
+
+def test_the_threads_of_libraries_are_restored():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with one_thread_per_kernel():
+            assert torch.get_num_threads() == 1
+            with one_thread_per_kernel():
+                assert torch.get_num_threads() == 1
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_sums_over_blocks_do_not_depend_on_threads(threads):
+    from pipeline.functional.kmeans import kmeans
+    from pipeline.functional.pca import principal_axes_in_blocks, project_onto_axes
+
+    x = torch.from_numpy(np.random.default_rng(0).normal(size=(40_000, 24)).astype(np.float32))
+
+    def compute() -> list[bytes]:
+        mean, axes = principal_axes_in_blocks(x, dim=8)
+        projected = project_onto_axes(x, mean, axes)
+        label, centre = kmeans(projected, count=50, seed=0, iterations=5)
+        return [array.numpy().tobytes() for array in (mean, axes, projected, label, centre)]
+
+    use_threads(1)
+    serial = compute()
+    use_threads(threads)
+    assert compute() == serial
