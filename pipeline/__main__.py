@@ -32,7 +32,16 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pipeline.cli.cache import cache_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.cli.sweep import FailedJobs, failures_text, record_failed_job
-from pipeline.configuration import CONF, PACKAGE, build_options, build_stages, build_variant, check_fields
+from pipeline.configuration import (
+    CONF,
+    PACKAGE,
+    build_options,
+    build_stages,
+    build_variant,
+    check_fields,
+    suggest_field,
+    suggest_variant,
+)
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.checkpoints import offline
 from pipeline.io.digests import track_files
@@ -42,6 +51,14 @@ from pipeline.store import Store
 COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
 RESUME = "Completed entries are cached; rerun to resume."
 READERS = ("__main__.py", "configuration.py")  # our modules whose frames may lie between Hydra's
+NEEDED = {
+    "dataset.K": "[fx,fy,cx,cy] in pixels",
+    "dataset.mesh": "the file of a mesh in millimetres",
+    "dataset.image": "the photograph's file",
+    "dataset.root": "the dataset's folder",
+    "detect.path": "a detector's json file",
+}
+"""What required fields take, by name."""
 QUOTING_EXAMPLE = """'dataset.image="my shot.png"'"""
 
 
@@ -93,7 +110,14 @@ def _format_error(error: BaseException) -> str:
     """An error as one line, without the parts of Hydra's messages that do not help here."""
     text = str(error).split("\nConfig search path")[0]
     if text.startswith("Could not override"):
-        text = f"{text.splitlines()[0].rstrip('.')}: found no such field, needs one that the yamls in conf/ have"
+        name = text.split("'")[1]
+        needed = f"needs one that the yamls in conf/ have{suggest_field(name)}"
+        text = f"Could not override '{name}': found no such field, {needed}"
+    if "Could not find '" in text:
+        name, _, listed = text.partition("Could not find '")[2].partition("'")
+        group, _, variant = name.rpartition("/")
+        note = f" (own variants need --config-dir){suggest_variant(group, variant)}"
+        text = f"Could not find '{name}'{note} {listed}"
     if "hydra.cc" in text:  # a value that Hydra's grammar cannot parse
         text = text.split("See https")[0].strip()
         text = f"{text}: a value with special characters needs both kinds of quotes, as {QUOTING_EXAMPLE}"
@@ -122,7 +146,8 @@ def _hydra_main(config: DictConfig) -> None:
     try:
         _run_job(config, resume=sweeping)
     except MissingMandatoryValue as error:
-        _fail_job(config, BadInput(error.full_key, found="nothing", needed="a value: the yaml in conf/ says which"))
+        needed = NEEDED.get(str(error.full_key), "a value: the yaml in conf/ says which")
+        _fail_job(config, BadInput(error.full_key, found="nothing", needed=needed))
     except OmegaConfBaseException as error:
         _fail_job(config, DzopError(_format_error(error).removeprefix("error: ")))
     except DzopError as error:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
+from omegaconf import OmegaConf
 from pydantic.dataclasses import is_pydantic_dataclass
 
 from pipeline.errors import BadInput
@@ -15,7 +17,7 @@ from pipeline.io.checkpoints import NotDownloaded
 from pipeline.method import Stages
 from pipeline.options import Evaluate, Options, Select
 from pipeline.route import SecondLook
-from pipeline.spec import build
+from pipeline.spec import build, did_you_mean
 
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
@@ -23,6 +25,11 @@ STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond",
 OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method")
 REQUIRED = (*STAGES, *OPTIONS, "second_look", "fallback", "dataset", "store", "runtime", "select", "evaluate")
 """Fields of config.yaml that a run needs and that ``~field`` on the command line can remove."""
+
+OWN_CLASS_WARNING = (
+    "a class outside the package: cached results are found by its kind, version and fields, not by its code; "
+    "raise its version after a change, or use store=memory"
+)
 
 
 def check_fields(values: Mapping[str, Any]) -> None:
@@ -54,16 +61,20 @@ def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options
         "config": values,
         "resume": resume,
     }
-    return build(Options, given | built, where="config")
+    return build(Options, given | built, where="")
 
 
 def build_variant(values: Mapping[str, Any], where: str) -> Any:
     """The spec whose class ``_target_`` names, with checked fields; ``auto`` variants return the one they select.
 
-    Fields that have a ``_target_`` of their own are built first, to any depth. Raises BadInput.
+    Fields that have a ``_target_`` of their own are built first, to any depth. Raises BadInput. Warns on stderr that
+    results of a class outside the package are found by its kind, version and fields, not by its code.
     """
     fields = {name: _build_field(value, f"{where}.{name}") for name, value in values.items()}
     cls = _find_class(fields.pop("_target_", None), f"{where}._target_")
+    if where.split(".")[0] in STAGES and cls.__module__.split(".")[0] != "pipeline":
+        _check_kind(cls, where)
+        print(f"warning: {where}: {OWN_CLASS_WARNING}", file=sys.stderr)
     variant: Any = build(cls, fields, where=where)
     return variant.resolve() if hasattr(variant, "resolve") else variant
 
@@ -88,6 +99,18 @@ def _find_class(target: object, where: str) -> type:
     return cls
 
 
+def _check_kind(cls: type, where: str) -> None:
+    """Raise BadInput unless an own variant's kind, which its cached results are found by, belongs to it alone."""
+    module, kind = cls.__module__.split(".")[-1], getattr(cls, "kind", None)
+    stage = where if where in STAGES else str(kind).split(".")[0]  # a nested field may hold a variant of another stage
+    place = f"{cls.__module__}.{cls.__qualname__}.kind"
+    if kind != f"{stage}.{module}":
+        needed = f"{stage}.{module}, the stage and the file name: variants of one kind would share cached results"
+        raise BadInput(place, found=repr(kind), needed=needed)
+    if (CONF / stage / f"{module}.yaml").exists():
+        raise BadInput(place, found=f"{kind!r}, which is the package's", needed="a file name of its own")
+
+
 def _may_import_others() -> bool:
     """Whether classes outside the package may be imported.
 
@@ -99,6 +122,41 @@ def _may_import_others() -> bool:
     hydra = HydraConfig.get()
     has_config_dir = any(source.provider == "command-line" for source in hydra.runtime.config_sources)
     return has_config_dir and not any("_target_" in override for override in hydra.overrides.task)
+
+
+def suggest_field(name: str) -> str:
+    """What a field that a command line sets in vain may mean: that of another variant, or one with a similar name."""
+    known = _list_fields()
+    if choices := known.get(name):
+        return f"; {', '.join(choices)} {'has' if len(choices) == 1 else 'have'} it"
+    group, dot, field = name.rpartition(".")
+    return did_you_mean(field, [k.removeprefix(group + dot) for k in known if k.rpartition(".")[0] == group])
+
+
+def suggest_variant(group: str, name: str) -> str:
+    """The variant of a group with the most similar name."""
+    return did_you_mean(name, [path.stem for path in (CONF / group).glob("*.yaml")])
+
+
+def _list_fields() -> dict[str, list[str]]:
+    """Every field that the package's yamls have, with the choices, such as ``dataset=photo``, that have it."""
+    known: dict[str, list[str]] = {}
+    for path in sorted(CONF.rglob("*.yaml")):
+        values = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        is_global = path.parent == CONF or path.read_text().startswith("# @package _global_")
+        group = "" if path.parent == CONF else path.parent.relative_to(CONF).as_posix()
+        prefix = "" if is_global else group.replace("/", ".") + "."
+        for name in [group, *_flatten(values, prefix)]:
+            known.setdefault(name, []).append(f"{group}={path.stem}")
+    return known
+
+
+def _flatten(values: Any, prefix: str) -> list[str]:
+    """Dotted names of all fields of nested mappings."""
+    names = []
+    for name, value in values.items() if isinstance(values, Mapping) else ():
+        names += [f"{prefix}{name}", *_flatten(value, f"{prefix}{name}.")]
+    return names
 
 
 def _model_name(extract: Any) -> str:

@@ -80,7 +80,7 @@ class Route:
     clock: Clock = field(default_factory=Clock)
 
     def solve(self, start: Hypothesis) -> Hypothesis:
-        """Complete a hypothesis from its template, or record why it has no pose."""
+        """Estimate the pose of a hypothesis from its template, or record why it has none."""
         parts: dict[str, Any] = {}
         try:
             with self.clock("read template"):
@@ -152,7 +152,7 @@ class Route:
         return points_obj, camera.apply_homography(np.linalg.inv(self.query.A_crop_img), query_px)
 
     def solve_pose(self, points_obj: Float[np.ndarray, "m 3"], query_px_img: Float[np.ndarray, "m 2"]) -> PoseSolution:
-        """The pose of the points on the object, solved in the solver's plane; its error is in image pixels."""
+        """The pose of the points on the object, solved in the solver's pixel frame; its error is in image pixels."""
         query = self.query
         on_object = np.isfinite(points_obj).all(1)
         if on_object.sum() < MIN_POINTS:
@@ -181,7 +181,7 @@ class Route:
         return self.stages.choose(hypothesis.solution.T_cam_obj, hypothesis.inliers, geometry)
 
     def refine(self, hypothesis: Hypothesis) -> Hypothesis:
-        """The hypothesis with its pose refined. Its inliers stay the solver's, which is what scores are based on."""
+        """The hypothesis with its pose refined. Inliers stay those of the solver, because the score uses them."""
         solution, pair = hypothesis.solution, hypothesis.pair
         if solution is None or pair is None or hypothesis.points_obj is None or hypothesis.query_px_img is None:
             return hypothesis
@@ -223,10 +223,10 @@ class Route:
 def solver_plane(
     plane: Plane, query: Query, crop_size: int
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """A_plane_img, K_plane and R_plane_cam of the plane that a solver works in.
+    """A_plane_img, K_plane and R_plane_cam of a solver's plane, the pixel frame that its threshold is measured in.
 
-    The image's plane is scaled down where the crop is larger than ``LARGEST_CROP_PX`` in it, so that a threshold in
-    pixels never means less than a fixed share of the object: features do not locate points any finer.
+    ``image``: pixels of the photograph; ``crop``: pixels of the query's crop. Large crops are scaled to at most 160 px
+    a side, so that the pixel threshold is not finer than the features.
     """
     if plane == "crop":
         return query.A_crop_img, *camera.crop_camera(query.A_crop_img, query.K)

@@ -143,8 +143,7 @@ def _estimate(graph: Graph, options: Options) -> None:
         print(f"already finished: {folder.record}")
         return
     warnings = graph.warnings()
-    for warning in warnings[:MAX_ROWS]:
-        print(f"warning: {warning}", flush=True)
+    _print_warnings(warnings)
     answers = graph.estimate()
     evaluation = None if scores is None else scores.evaluate(answers)
     write_files(folder, answers, evaluation, warnings)
@@ -152,10 +151,17 @@ def _estimate(graph: Graph, options: Options) -> None:
     if options.overlays:
         pictures.draw_overlays()
     _print_results(answers, evaluation, theta_max=options.evaluate.theta_max)
+    _print_warnings(warnings)
     print(places_text(folder, overlays=options.overlays))
     if evaluation is not None:
         cases = pictures.draw_gallery(options.gallery)
         print(f"record    {write_record(folder, answers, evaluation, cases)}")
+
+
+def _print_warnings(warnings: Sequence[str]) -> None:
+    """Warnings are printed before the poses are estimated and again after them, where a reader looks."""
+    for warning in warnings[:MAX_ROWS]:
+        print(f"warning: {warning}", flush=True)
 
 
 def _make_folder(out: Path) -> None:

@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
 from hashlib import sha256
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, dataclass_transform
 
@@ -96,7 +97,7 @@ def digest(value: Any) -> str:
 def build(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
     """Build the spec ``cls`` from configuration values; lists become tuples.
 
-    Raises BadInput for the first invalid field, which it names ``where.field``.
+    Raises BadInput for the first invalid field, which it names ``where.field``, or ``field`` if ``where`` is "".
     """
     try:
         return cls(**lists_to_tuples(values))
@@ -126,8 +127,15 @@ def _explain_value(error: ErrorDetails, where: str, cls: type) -> BadInput:
 
 
 def _explain_unknown(error: ErrorDetails, where: str, cls: type) -> BadInput:
-    known = ", ".join(f.name for f in fields(cls))
-    return BadInput(_field(where, error["loc"]), found="an unknown field", needed=f"one of: {known}")
+    known = [f.name for f in fields(cls)]
+    needed = f"one of: {', '.join(known)}{did_you_mean(str(error['loc'][-1]), known)}"
+    return BadInput(_field(where, error["loc"]), found="an unknown field", needed=needed)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for the known name that is most similar to an unknown one, "" if none is."""
+    similar = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {similar[0]}?" if similar else ""
 
 
 def _explain_missing(error: ErrorDetails, where: str, cls: type) -> BadInput:
@@ -158,7 +166,7 @@ _EXPLANATIONS: dict[str, Callable[[ErrorDetails, str, type], BadInput]] = {
 
 
 def _field(where: str, loc: Iterable[int | str]) -> str:
-    return ".".join([where, *(str(part) for part in loc)])
+    return ".".join([*filter(None, [where]), *(str(part) for part in loc)])
 
 
 def _count_values(count: int) -> str:

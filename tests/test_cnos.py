@@ -338,7 +338,7 @@ def test_a_plan_of_a_photograph_runs_no_model(photo):
         (("detect.proposals.min_iou=2",), "detect.proposals.min_iou"),
         (("detect.proposals.weights=./nowhere",), "detect.proposals.weights: found './nowhere'"),
         (("detect.describe_layer=-2",), "detect.describe_layer"),
-        (("dataset.mask=a.png", "dataset.bbox=[1,2,3,4]"), "both of mask and bbox"),
+        (("dataset.mask=a.png", "dataset.bbox=[1,2,3,4]"), "mask and bbox, needs only one of them"),
         (
             ("dataset.mesh=[a.ply,b.ply]", "dataset.mask=a.png"),
             "found 2 meshes and the location of one object",

@@ -244,7 +244,20 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
     [
         (("cluster.size=3",), "Could not override 'cluster.size'"),
         (("+cluster.size=3",), "cluster.size: found an unknown field, needs one of: count"),
-        (("match=nearest",), "Could not find 'match/nearest' Available options in 'match': cosine masked_cosine"),
+        (
+            ("match=nearest",),
+            "Could not find 'match/nearest' (own variants need --config-dir) Available options in 'match'",
+        ),
+        (("match=cosin",), "; did you mean cosine? Available options in 'match': cosine masked_cosine"),
+        (("cluster.cuont=3",), "needs one that the yamls in conf/ have; did you mean count?"),
+        (
+            ("dataset.mask=a.png",),
+            "found no such field, needs one that the yamls in conf/ have; dataset=photo has it",
+        ),
+        (
+            ("+match.topk=3",),
+            "found an unknown field, needs one of: layer, top_k; did you mean top_k?",
+        ),
         (("match.top_k=0",), "match.top_k: found 0, needs greater than or equal to 1"),
         (("fuse.layers=[2,12]",), "fuse.layers: found 12, needs one of 2, 5, 8, 11"),
         (("match.layer=7",), "match.layer: found 7, needs one of 2, 5, 8, 11"),
@@ -336,6 +349,34 @@ class First(Matcher):
 '''
 
 
+@pytest.mark.parametrize(
+    ("kind", "needed"),
+    [
+        ("match.other", "found 'match.other', needs match.first, the stage and the file name"),
+        ("fuse.first", "found 'fuse.first', needs match.first, the stage and the file name"),
+    ],
+)
+def test_a_kind_names_stage_and_file_so_that_no_two_variants_share_results(dzop, tmp_path, monkeypatch, kind, needed):
+    name = kind.replace(".", "_")  # a package of its own: imported modules stay imported
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "first.py").write_text(MATCHER.replace("match.first", kind))
+    (tmp_path / "conf" / "match").mkdir(parents=True)
+    (tmp_path / "conf" / "match" / "first.yaml").write_text(f"_target_: {name}.first.First\nlayer: 2\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ran = dzop("--config-dir", str(tmp_path / "conf"), "match=first", "plan=true")
+    assert f"error: {name}.first.First.kind: {needed}" in ran.err
+
+
+def test_an_own_variant_may_not_have_a_kind_of_the_package(dzop, tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "cosine.py").write_text(MATCHER.replace("match.first", "match.cosine"))
+    (tmp_path / "conf" / "match").mkdir(parents=True)
+    (tmp_path / "conf" / "match" / "first.yaml").write_text("_target_: own.cosine.First\nlayer: 2\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ran = dzop("--config-dir", str(tmp_path / "conf"), "match=first", "plan=true")
+    assert "error: own.cosine.First.kind: found 'match.cosine', which is the package's" in ran.err
+
+
 def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "first.py").write_text(MATCHER)
@@ -345,6 +386,7 @@ def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
     ran = dzop("--config-dir", str(tmp_path / "conf"), f"store.root={cache}", "match=first")
     assert ran.status == 0, ran.err
     answers = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
+    assert "warning: match: a class outside the package: cached results are found by its kind, version" in ran.err
     assert {answer["template_id"] for answer in answers if answer["status"] == "estimate"} <= {0}
     assert (
         json.loads((results(tmp_path) / "poses.json").read_text())["config"]["match"]["_target_"]
@@ -359,10 +401,13 @@ def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
         (("dataset.K=[nan,300,160,120]",), "nan"),
         (("dataset.K=[3000,3000,1600,1200]",), "dataset.K"),
         (("dataset.bbox=[100,80,nan,60]",), "dataset.bbox: found [100.0, 80.0, nan, 60.0], needs four finite numbers"),
+        (("dataset.bbox=[100,80,60]",), "dataset.bbox: found 3 numbers, needs 4: [x,y,width,height]"),
+        (("dataset.bbox=[100,80,0,60]",), "dataset.bbox: found [100.0, 80.0, 0.0, 60.0], which has no area"),
+        (("dataset.K=???",), "dataset.K: found nothing, needs [fx,fy,cx,cy] in pixels"),
         (("dataset.bbox=[900,80,60,60]",), "dataset.bbox: found [900.0, 80.0, 60.0, 60.0]"),
         (("dataset.mesh=nowhere.ply",), "nowhere.ply: found no such file"),
         (("dataset.scale=0.001",), "it looks like metres"),
-        (("dataset.mask=both.png",), "dataset: found both of mask and bbox"),
+        (("dataset.mask=both.png",), "dataset: found mask and bbox, needs only one of them"),
     ],
 )
 def test_a_mistake_in_ones_own_data_is_reported_in_one_line(tmp_path, scene, capsys, monkeypatch, given, message):

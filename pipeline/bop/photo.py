@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -40,7 +41,7 @@ class PhotoConfig(Spec):
     K: tuple[Any, ...]
     mask: str | None = None
     mask_label: Positive | None = None
-    bbox: tuple[float, float, float, float] | None = None
+    bbox: tuple[float, ...] | None = None
     scale: PositiveFloat = 1.0
     name: str = "photo"
 
@@ -55,17 +56,15 @@ class PhotoConfig(Spec):
         check_K(K, size_hw, "dataset.K")
         _check_principal_point(K, size_hw)
         if self.mask is not None and self.bbox is not None:
-            raise BadInput(
-                "dataset", found="both of mask and bbox", needed="dataset.mask=FILE or dataset.bbox=[x,y,w,h]"
-            )
+            raise BadInput("dataset", found="mask and bbox", needed="only one of them")
         meshes = (self.mesh,) if isinstance(self.mesh, str) else self.mesh
         if not meshes or (len(meshes) > 1 and (self.mask or self.bbox)):
             found = f"{len(meshes)} meshes" + (" and the location of one object" if meshes else "")
             raise BadInput(
                 "dataset.mesh", found=found, needed="one mesh, or several without dataset.mask and dataset.bbox"
             )
-        if self.bbox is not None and not np.isfinite(self.bbox).all():
-            raise BadInput("dataset.bbox", found=list(self.bbox), needed="four finite numbers: x, y, width, height")
+        if self.bbox is not None:
+            _check_box(self.bbox)
         return Photo(
             name=self.name,
             root=image.parent,
@@ -94,6 +93,17 @@ class PhotoConfig(Spec):
         raise BadInput(
             "dataset.K", found=f"{len(flat)} numbers", needed="[fx,fy,cx,cy] or the 9 of the matrix, row by row"
         )
+
+
+def _check_box(bbox_xywh: Sequence[float]) -> None:
+    """Raise BadInput for a box that is not four finite numbers with an area."""
+    if len(bbox_xywh) != 4:
+        raise BadInput("dataset.bbox", found=f"{len(bbox_xywh)} numbers", needed="4: [x,y,width,height]")
+    if not np.isfinite(bbox_xywh).all():
+        raise BadInput("dataset.bbox", found=list(bbox_xywh), needed="four finite numbers: [x,y,width,height]")
+    if min(bbox_xywh[2:]) <= 0:
+        found = f"{list(bbox_xywh)}, which has no area"
+        raise BadInput("dataset.bbox", found=found, needed="[x,y,width,height] with width and height above 0")
 
 
 def _check_principal_point(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> None:

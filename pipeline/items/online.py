@@ -60,7 +60,11 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class TemplateView:
-    """One template with everything correspondences need. ``rgb`` is its crop where it was rendered for one query."""
+    """One template with all that finding correspondences needs.
+
+    ``depth_mm``, ``K`` and ``T_cam_obj`` are those of the rendered view; ``A_crop_img`` maps its pixels to crop pixels.
+    ``rgb``: the crop of a view that was rendered for one query (rerender); None for a stored template.
+    """
 
     crop: CropFeatures
     A_crop_img: Float[np.ndarray, "3 3"]
@@ -137,14 +141,16 @@ class Hypothesis:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What stages clamped or skipped."""
+        """What stages limited or skipped."""
         notes = (self.pair and self.pair.note, self.clusters and self.clusters.note)
         return tuple(note for note in notes if note)
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The online route of one detection: matched templates, a hypothesis for each (best first), seconds by stage."""
+    """What the route computed for one detection: the matched templates, one hypothesis for each, and the seconds of
+    each stage. Hypotheses are sorted by score, the best first; the first is refined.
+    """
 
     match: TemplateMatch
     hypotheses: tuple[Hypothesis, ...]

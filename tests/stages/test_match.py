@@ -3,10 +3,12 @@ import pytest
 import torch
 from array_bank import match as match_maps
 from array_bank import match_truth
+from jaxtyping import TypeCheckError
 
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.masks import cell_mask
 from pipeline.functional.rigid import look_at, rigid, rotation_between
+from pipeline.stages.match import rank
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.masked_cosine import MaskedCosine
 from pipeline.stages.match.oracle import Oracle
@@ -22,6 +24,13 @@ def _bank(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
     for i in range(n):
         mask[i, 4 : 20 + i % 8, 6 : 28 - i % 5] = True
     return torch.randn(n, 10, 8, 8, generator=generator).half(), mask
+
+
+def test_scores_of_another_shape_are_refused():
+    with pytest.raises(
+        (BadInput, TypeCheckError), match=r"needs \(n,\)|score"
+    ):  # the tests' own type check comes first
+        rank(torch.ones(5, 1), top_k=2)
 
 
 @pytest.mark.parametrize("match", [*PER_CELL, *WORDS], ids=repr)

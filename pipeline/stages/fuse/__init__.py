@@ -35,7 +35,7 @@ class Fuser(Spec, ABC, Generic[Encoded]):
     """Contract of a fuse variant: ``encode`` runs once per image and is memoised, ``pair`` once per template match.
 
     ``layers``: the decoder layers it reads. ``joint``: True where a map of the pair depends on both images; then
-    ``encode`` hands its input on, and what is computed from such a map cannot be reused for another pair.
+    ``encode`` returns its input unchanged, and what is computed from such a map cannot be reused for another pair.
     """
 
     layers: tuple[int, ...]

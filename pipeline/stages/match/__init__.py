@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.errors import NoPose
+from pipeline.errors import BadInput, NoPose
 from pipeline.items.fit import Fit
 from pipeline.items.matches import TemplateMatch
 from pipeline.items.online import Query, TemplateBank
@@ -27,19 +27,23 @@ class Matcher(Spec, ABC):
 
     @property
     def fit(self) -> Fit | None:
-        """What is fitted to the templates offline; with it, ``bank.features`` is not read."""
+        """What is fitted to the templates offline, such as visual words. A matcher with a fit reads
+        ``bank.fitted(fit)`` instead of ``bank.features``.
+        """
         return None
 
     @abstractmethod
     def __call__(self, query: Query, bank: TemplateBank) -> TemplateMatch:
-        """The best templates of one query. Raises NoPose when nothing can be compared."""
+        """The best templates of one query; a higher score is better. Raises NoPose when nothing can be compared."""
 
 
 def rank(score: Float[Tensor, " n"], *, top_k: int) -> TemplateMatch:
-    """The ``top_k`` highest of all templates' scores, ties by index.
+    """The ``top_k`` highest of all templates' scores, ties by index. A higher score is better.
 
-    Raises NoPose when scores are not finite or all are 0.
+    Raises BadInput for scores of another shape, and NoPose when scores are not finite or all are 0.
     """
+    if score.ndim != 1:
+        raise BadInput("match", found=f"scores of shape {tuple(score.shape)}", needed="(n,): one score per template")
     if not bool(torch.isfinite(score).all()):
         raise NoPose("match", "features are not finite")
     if not bool(score.any()):

@@ -23,7 +23,7 @@ PnpPoints = Annotated[int, Field(ge=4)]  # three points allow up to four poses
 class Solver(Spec, ABC):
     """Contract of a solve variant.
 
-    ``plane``: the plane whose pixels its threshold is measured in. ``crop``: a threshold is the same share of every
+    ``plane``: the pixel frame that its threshold is measured in. ``crop``: a threshold is the same share of every
     object, near or far. ``image``: pixels of the full image, scaled down where the crop is larger than 160 of them, so
     that a photograph of many megapixels does not make the threshold finer than the features (route.solver_plane).
     """
