@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,7 @@ from pipeline.store.completion import intact_record
 from pipeline.store.keys import Ref
 
 FOLDER = ".written"
+RUNNING_S = 120.0  # a writer that stored rows this short a while ago may still be running
 
 
 @dataclass(frozen=True)
@@ -45,16 +47,27 @@ def note_rows(
 
     ``arrays``: array name -> digest of its metadata. ``chunks``: array name -> checksums of the rows in hex.
     """
-    content = {"folder": folder, "first": first, "arrays": dict(arrays), "chunks": chunks}
+    content = {"folder": folder, "first": first, "arrays": dict(arrays), "chunks": chunks, "at": time.time()}
     text = json.dumps(content | {"seal": digest([ref.key, content])})
     write_bytes(store, f"{ref.path}/{FOLDER}/{writer}-{first}", text.encode())
 
 
-def read_journal(store: ZarrStore, ref: Ref, arrays: Mapping[str, str]) -> list[StoredRows]:
-    """What writers stored of an entry whose arrays have this metadata; also what its withdrawn record lists."""
+def note_end(store: ZarrStore, ref: Ref, writer: str, *, folder: str) -> None:
+    """Say that the writer ended early, so that its rows can be kept at once."""
+    note_rows(store, ref, writer, folder=folder, first=-1, arrays={}, chunks={})
+
+
+def read_journal(store: ZarrStore, ref: Ref, arrays: Mapping[str, str], *, has_locks: bool) -> list[StoredRows]:
+    """What writers stored of an entry whose arrays have this metadata; also what its withdrawn record lists.
+
+    Without locks, rows of a writer that may still be running are left out, so that two writers of other bytes do not
+    end with an entry of both.
+    """
     found: list[StoredRows] = []
     (attributes,) = read_attributes(store, [ref.path])
-    records: list[Any] = _read_notes(store, ref)
+    notes = _read_notes(store, ref)
+    running = set() if has_locks else _running_writers(notes)
+    records: list[Any] = [note for note in notes if note.get("folder") not in running]
     if attributes is not None and (damaged := intact_record(attributes, "damaged", ref.key)):
         records.append(dict(damaged) | {"first": 0})
     for record in records:
@@ -67,6 +80,12 @@ def read_journal(store: ZarrStore, ref: Ref, arrays: Mapping[str, str]) -> list[
         except (KeyError, TypeError, ValueError, AttributeError):  # a record without checksums, of an older version
             continue
     return found
+
+
+def _running_writers(notes: Sequence[Mapping[str, Any]]) -> set[str]:
+    """Folders of writers that wrote to the journal a short while ago, and not that they ended."""
+    recent = {note["folder"] for note in notes if abs(time.time() - note["at"]) < RUNNING_S}
+    return recent - {note["folder"] for note in notes if note["first"] == -1}
 
 
 def forget_rows(store: ZarrStore, ref: Ref) -> None:

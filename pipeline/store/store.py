@@ -123,11 +123,12 @@ class Store:
     # --- reading ---------------------------------------------------------------------------------------------------
 
     def read(self, ref: Ref) -> Entry:
-        """Open a complete entry. Raises DamagedEntry when it is missing or incomplete."""
+        """Open a complete entry. Raises DamagedEntry if it is missing or incomplete, NewerEntry for a newer format."""
         self._take_lease(ref)
-        attributes = self.attributes(ref.path)
-        record = None if attributes is None else completion_record(attributes, ref.key)
-        if attributes is None or record is None:
+        attributes = self.attributes(ref.path) or {}
+        check_format(attributes, f"{self.place}/{ref.path}")
+        record = completion_record(attributes, ref.key)
+        if record is None:
             raise mark_incomplete(self.backend, ref, "it is not complete")
         return Entry(self.backend, ref, attributes, record, self._note_use)
 
@@ -261,7 +262,7 @@ def _note_on_error(writers: list[EntryWriter]) -> Iterator[None]:
     except BaseException:
         with suppress(OSError, DzopError):
             for writer in writers:
-                writer.note()
+                writer.stop()
         raise
 
 

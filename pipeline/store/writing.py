@@ -43,7 +43,7 @@ from pipeline.store.backends import Announce, Backend
 from pipeline.store.checksums import ChunkRecorder, chunk_key, is_intact, to_hex
 from pipeline.store.completion import check_format, complete_attributes, completion_record, identity
 from pipeline.store.entry import mark_incomplete
-from pipeline.store.journal import StoredRows, forget_rows, note_rows, read_journal
+from pipeline.store.journal import StoredRows, forget_rows, note_end, note_rows, read_journal
 from pipeline.store.keys import Ref
 
 MARKER = ".dzop"
@@ -119,7 +119,7 @@ class EntryWriter:
         folder = "" if backend.has_locks else name
         writer = cls(backend, ref, layouts, rows, name, folder, ChunkRecorder(backend.zarr))
         open_or_create_group(backend, ref, identity(ref), announce)
-        journal = read_journal(backend.zarr, ref, writer._digests)
+        journal = read_journal(backend.zarr, ref, writer._digests, has_locks=backend.has_locks)
         for array, layout in layouts.items():
             path = writer._path(folder, array)
             create = create_array if folder else _open_or_create_array
@@ -194,6 +194,11 @@ class EntryWriter:
                 arrays=self._digests, chunks=self._hex_checksums(range(first, last + 1)),
             )  # fmt: skip
         self._not_noted, self._noted_s, self._has_notes = [], time.monotonic(), True
+
+    def stop(self) -> None:
+        """Add what was stored to the journal, and that this writer has ended without completing the entry."""
+        self.note()
+        note_end(self.backend.zarr, self.ref, self.name, folder=self.folder)
 
     def _hex_checksums(self, rows: Sequence[int]) -> dict[str, str]:
         return {name: to_hex(checksums, rows) for name, checksums in self.checksums.items()}

@@ -10,6 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
+import pipeline.store.journal
 from pipeline.errors import BadInput
 from pipeline.store import DamagedEntry, S3StoreConfig, Store
 from pipeline.store.remote import StoreUnreachable
@@ -126,7 +127,8 @@ def faulty(s3) -> Iterator[ThreadingHTTPServer]:
 
 
 @pytest.mark.parametrize("status", [500, 503, 403])
-def test_a_server_fault_leaves_the_entry_incomplete_and_the_next_run_completes_it(s3, status):
+def test_a_server_fault_leaves_the_entry_incomplete_and_the_next_run_completes_it(s3, status, monkeypatch):
+    monkeypatch.setattr(pipeline.store.journal, "RUNNING_S", 0.0)  # as if the next run started minutes later
     with faulty(s3) as server:
         store = Store(s3.config(endpoint_url=f"http://127.0.0.1:{server.server_address[1]}"))
         server.status, written = status, []
