@@ -81,7 +81,7 @@ def test_a_mesh_of_the_wrong_diameter_is_refused_even_with_cached_templates(
     dzop(f"store.root={cache}", "step=onboard")
     other = shutil.copytree(scene, tmp_path / "other")
     info = json.loads((other / "models" / "models_info.json").read_text())
-    info["2"]["diameter"] *= 2
+    info["2"]["diameter"] *= 10
     (other / "models" / "models_info.json").write_text(json.dumps(info))
     dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={other}", f"store.root={cache}", *SMALL)
     ran = run_dzop(capsys, monkeypatch, *dataset, "step=estimate", "cluster.count=7")

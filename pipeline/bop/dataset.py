@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.bop.images import image_size, read_depth, read_mask, read_rgb
 from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
+from pipeline.bop.layout import check_folders, check_scene_folder, find_model
 from pipeline.bop.models import ModelInfo, check_model_files, read_model, read_models_info
 from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
 from pipeline.errors import BadInput
@@ -50,8 +52,9 @@ class DatasetConfig:
 class Dataset:
     """A BOP dataset whose targets have images, cameras and models. Pixels and meshes are read on demand.
 
-    ``targets`` are sorted by scene, image and object; ``models_info`` is empty without models_info.json. Every method
-    raises BadInput for input that cannot be used, in one line with the file, scene, image and field.
+    ``targets`` are sorted by scene, image and object; ``models_info`` is empty without models_info.json. ``warnings``:
+    results of sanity checks when it was opened. Every method raises BadInput for input that cannot be used, in one line
+    with the file, scene, image and field.
     """
 
     name: str
@@ -60,6 +63,7 @@ class Dataset:
     models: str
     models_info: dict[int, ModelInfo]
     targets: tuple[Target, ...] = ()
+    warnings: tuple[str, ...] = ()
     _scenes: dict[int, Scene] = field(default_factory=dict, repr=False)
 
     @property
@@ -86,10 +90,7 @@ class Dataset:
         """The scene; its JSON files are read once."""
         if scene_id not in self._scenes:
             folder = self.root / self.split / f"{scene_id:06d}"
-            if not folder.is_dir():
-                raise BadInput(
-                    describe_place(folder, scene=scene_id), found="no such folder", needed="the scene's folder"
-                )
+            check_scene_folder(folder, scene_id)
             self._scenes[scene_id] = Scene(folder, scene_id)
         return self._scenes[scene_id]
 
@@ -165,7 +166,7 @@ class Dataset:
 
     def model_path(self, obj_id: int, *, folder: str | None = None) -> Path:
         """The object's mesh file, in ``folder`` (None: the dataset's models)."""
-        return self.root / (folder or self.models) / f"obj_{obj_id:06d}.ply"
+        return find_model(self.root / (folder or self.models), obj_id)
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
         """Mesh, diameter and symmetries, from ``folder`` (None: the dataset's models; "models_eval" for metrics)."""
@@ -204,13 +205,14 @@ def open_dataset(
     models_cad or models_reconst). ``targets``: file of the targets; with None or a missing file, every annotated
     instance of every image is a target. Reads only JSON files and image headers. Raises BadInput at the first error.
     """
-    _check_folder(root, "the dataset", lambda folder: True)
-    _check_folder(root / split, "a split", lambda folder: any(folder.glob("[0-9]" * 6)))
-    _check_folder(root / models, "object models", lambda folder: any(folder.glob("obj_*.ply")))
+    check_folders(root, split, models)
     dataset = Dataset(name, root, split, models, read_models_info(root / models / "models_info.json"))
     path = None if targets is None else root / targets
-    if path is not None and file_exists(path):
-        dataset = replace(dataset, targets=_read_targets(path))
+    records = None if path is None or not file_exists(path) else read_json(path)
+    if path is not None and isinstance(records, list) and _are_images(records):
+        dataset = _use_annotated_objects(dataset, path, records)
+    elif path is not None and records is not None:
+        dataset = replace(dataset, targets=_read_targets(path, records))
     else:
         dataset = replace(dataset, targets=_list_annotated_targets(dataset))
     for obj_id in dataset.object_ids:
@@ -220,18 +222,31 @@ def open_dataset(
     return dataset
 
 
-def _check_folder(path: Path, what: str, is_candidate: Callable[[Path], bool]) -> None:
-    """Raise BadInput for a missing folder, listing the sibling folders that could be meant."""
-    if path.is_dir():
-        return
-    siblings = [p for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
-    candidates = sorted(p.name for p in siblings if is_candidate(p))
-    hint = f" (there: {', '.join(candidates[:12])})" if candidates else ""
-    raise BadInput(path, found="no such folder", needed=f"the folder of {what}{hint}")
+def _are_images(records: list[Any]) -> bool:
+    """Whether these are targets of BOP24's detection tasks: images, without the objects to find there."""
+    return bool(records) and all(_is_image(record) for record in records)
 
 
-def _read_targets(path: Path) -> tuple[Target, ...]:
-    records = read_json(path)
+def _is_image(record: Any) -> bool:
+    return isinstance(record, dict) and {"scene_id", "im_id"} <= record.keys() and "obj_id" not in record
+
+
+def _use_annotated_objects(dataset: Dataset, path: Path, records: list[Any]) -> Dataset:
+    """The dataset with every annotated instance of the images as a target, and a warning that says so."""
+    images = set()
+    for index, record in enumerate(records):
+        where = describe_place(path, target=index)
+        images.add((get_integer(record, "scene_id", where), get_integer(record, "im_id", where)))
+    scenes = sorted({scene_id for scene_id, _ in images})
+    if missing := [scene_id for scene_id in scenes if not dataset.has_ground_truth(scene_id)]:
+        found = f"targets without obj_id (BOP24's detection tasks), and no annotations in scene {missing[0]}"
+        raise BadInput(path, found=found, needed="scene_id, im_id, obj_id, inst_count: test_targets_bop19.json")
+    targets = _list_annotated_targets(dataset, images)
+    warning = f"{path.name}: targets have no obj_id (BOP24's detection tasks); the annotated objects are the targets"
+    return replace(dataset, targets=targets, warnings=(warning,))
+
+
+def _read_targets(path: Path, records: Any) -> tuple[Target, ...]:
     if not isinstance(records, list) or not records:
         raise BadInput(path, found=abbreviate(records), needed="a list of targets: scene_id, im_id, obj_id, inst_count")
     targets = []
@@ -249,13 +264,18 @@ def _read_targets(path: Path) -> tuple[Target, ...]:
     return _sort_targets(targets)
 
 
-def _list_annotated_targets(dataset: Dataset) -> tuple[Target, ...]:
-    """One target per object and image, with as many instances as are annotated."""
+def _list_annotated_targets(dataset: Dataset, images: set[tuple[int, int]] | None = None) -> tuple[Target, ...]:
+    """One target per object and image, with as many instances as are annotated. ``images``: None for all."""
     split = dataset.root / dataset.split
     folders = sorted(p for p in split.iterdir() if p.is_dir() and p.name.isdigit())
+    scene_ids = [int(folder.name) for folder in folders] if images is None else sorted({s for s, _ in images})
+    if images is None and folders and not any(map(dataset.has_ground_truth, scene_ids)):
+        found = "neither a targets file nor annotations (scene_gt.json), as in BOP's test sets"
+        needed = f"dataset.targets, a file of {dataset.root} with scene_id, im_id, obj_id, inst_count"
+        raise BadInput(split, found=found, needed=needed)
     targets = []
-    for scene in (dataset.scene(int(folder.name)) for folder in folders):
-        for im_id in scene.annotations:
+    for scene in map(dataset.scene, scene_ids):
+        for im_id in scene.annotations if images is None else sorted(i for s, i in images if s == scene.scene_id):
             counts = Counter(gt.obj_id for gt in scene.ground_truth(im_id))
             targets += [Target(scene.scene_id, im_id, obj_id, n) for obj_id, n in counts.items()]
     if not targets:

@@ -17,19 +17,30 @@ from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.io.digests import file_exists
 from pipeline.io.meshes import diameter_mm, read_mesh
-from pipeline.items.objects import ObjectModel
+from pipeline.items.objects import Mesh, ObjectModel
 
 MAX_SYMMETRY_STEP = 0.01
 """Largest displacement of a vertex between neighbouring discretised symmetries, as a fraction of the diameter (BOP)."""
 
 
+_UNITS = (("metres", 1000, 1.8), ("inches", 25.4, 1.1), ("centimetres", 10, 1.8), ("decimetres", 100, 1.8))
+"""Units that a mesh may have instead of mm: mm per unit, and how far a ratio of diameters may be off it.
+
+A bounding box's diagonal, which some datasets state as diameter, is up to 1.73 times the diameter.
+"""
+
+
 @dataclass(frozen=True, eq=False)
 class ModelInfo:
-    """An entry of models_info.json, mm. ``centre``: centre of the bounding box in the object frame, None if unknown."""
+    """An entry of models_info.json, mm. ``centre``: centre of the bounding box in the object frame, None if unknown.
+
+    ``is_diagonal``: whether the diameter is the box's diagonal. It is too long then, unless the object is a box.
+    """
 
     diameter_mm: float
     symmetries: Float[np.ndarray, "s 4 4"]
     centre: Float[np.ndarray, " 3"] | None
+    is_diagonal: bool = False
 
 
 def read_models_info(path: Path) -> dict[int, ModelInfo]:
@@ -45,19 +56,37 @@ def read_model(
 ) -> ObjectModel:
     """The object of a mesh file. ``distances_mm``: its annotated distances to the camera, to detect wrong units.
 
-    Raises BadInput for a mesh that models_info.json (if it exists) does not list, and for inconsistent lengths.
+    Raises BadInput for a mesh that models_info.json (if it exists) does not list, and for lengths in different units.
     """
     check_model_files(path, obj_id, infos)
     mesh = read_mesh(path)
     measured = diameter_mm(mesh)
     info = infos.get(obj_id)
-    if info is not None and abs(measured - info.diameter_mm) > 0.1 * info.diameter_mm:
-        metres = " (it looks like metres)" if 500 < info.diameter_mm / measured < 2000 else ""
-        found = f"a mesh of diameter {measured:.4g}{metres} where models_info.json says {info.diameter_mm:.4g}"
-        raise BadInput(path, found=found, needed="vertices in millimetres and the diameter of this mesh")
+    warning = "" if info is None else _compare_diameters(path, mesh, measured, info)
     if fault := _describe_unit_fault(measured, distances_mm):
         raise BadInput(path, found=fault, needed="mesh and cam_t_m2c both in millimetres")
-    return ObjectModel(obj_id, mesh, info.diameter_mm, info.symmetries) if info else ObjectModel(obj_id, mesh, measured)
+    if info is None:
+        return ObjectModel(obj_id, mesh, measured)
+    return ObjectModel(obj_id, mesh, info.diameter_mm, info.symmetries, warning)
+
+
+def _compare_diameters(path: Path, mesh: Mesh, measured: float, info: ModelInfo) -> str:
+    """A warning if models_info.json states another diameter than the mesh has, "" if they agree.
+
+    Raises BadInput if the two look like different units of length.
+    """
+    stated = info.diameter_mm
+    if abs(measured - stated) <= 0.1 * stated:
+        return ""
+    says = f"a mesh of diameter {measured:.4g}{{}} where models_info.json says {stated:.4g}"
+    for unit, factor, tolerance in _UNITS:
+        for of_mesh, ratio in ((True, stated / measured), (False, measured / stated)):
+            if factor / tolerance < ratio < factor * tolerance:
+                looks = f" (it looks like {unit})" if of_mesh else f" (models_info.json looks like {unit})"
+                raise BadInput(path, found=says.format(looks), needed="both in millimetres")
+    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    hint = ", the diagonal of its bounding box" if abs(stated - diagonal) < 0.02 * diagonal else ""
+    return f"{path.name}: found {says.format('')}{hint}; scores use models_info.json, as BOP's do"
 
 
 def check_model_files(path: Path, obj_id: int, infos: dict[int, ModelInfo]) -> None:
@@ -122,7 +151,10 @@ def _parse_model_info(record: Any, where: str) -> ModelInfo:
         axes.append(axis)
         offsets.append(offset)
     arrays = np.reshape(discrete, (-1, 4, 4)), np.reshape(axes, (-1, 3)), np.reshape(offsets, (-1, 3))
-    return ModelInfo(float(diameter), symmetry_transforms(*arrays), _parse_centre(record, where))
+    box = _parse_box(record, where)
+    is_diagonal = box is not None and abs(float(diameter) / float(np.linalg.norm(box[3:]) or 1) - 1) < 0.001
+    centre = None if box is None else box[:3] + box[3:] / 2
+    return ModelInfo(float(diameter), symmetry_transforms(*arrays), centre, is_diagonal)
 
 
 def _parse_discrete(value: Any, where: str) -> Float[np.ndarray, "4 4"]:
@@ -150,10 +182,9 @@ def _get_list(record: Any, field: str, where: str) -> list[Any]:
     return value
 
 
-def _parse_centre(record: Any, where: str) -> Float[np.ndarray, " 3"] | None:
-    """Centre of the bounding box min_x .. size_z, None if it is not given."""
+def _parse_box(record: Any, where: str) -> Float[np.ndarray, " 6"] | None:
+    """min_x, min_y, min_z, size_x, size_y, size_z of the bounding box; None if it is not given."""
     names = [f"{kind}_{axis}" for kind in ("min", "size") for axis in "xyz"]
     if not all(name in record for name in names):
         return None
-    low_and_size = parse_vector([record[name] for name in names], 6, f"{where}, fields min_x to size_z")
-    return low_and_size[:3] + low_and_size[3:] / 2
+    return parse_vector([record[name] for name in names], 6, f"{where}, fields min_x to size_z")

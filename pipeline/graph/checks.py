@@ -42,12 +42,14 @@ def check_layers(stages: Stages) -> None:
             raise BadInput(field_of_layer[layer], found=error.found, needed=needed) from None
 
 
-def detection_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
-    """Warnings of the detector, then one line per suspicious camera, then one per suspicious detection.
+def detection_warnings(context: Context, detections: Sequence[Detection], *, cached: bool = False) -> list[str]:
+    """Warnings of dataset, models and detector, then one line per suspicious camera, then one per detection.
 
-    Cameras are checked only without ground truth: annotated poses show that a camera is right.
+    ``cached``: whether all poses are stored. Cameras are checked only without ground truth: annotated poses show that
+    a camera is right.
     """
-    warnings = context.stages.detect.warnings(context.dataset, context.targets)
+    warnings = [*context.dataset.warnings, *_check_models(context, cached=cached)]
+    warnings += context.stages.detect.warnings(context.dataset, context.targets)
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
@@ -60,6 +62,17 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
         if d.defect is None and (problem := _check_detection(context, d)):
             warnings.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {problem}")
     return warnings
+
+
+def _check_models(context: Context, *, cached: bool) -> list[str]:
+    """Warnings about meshes. ``cached``: poses need no mesh, so only those with an unlikely diameter are read.
+
+    Without models_info.json nothing is compared, and no mesh is read for it.
+    """
+    infos = context.dataset.models_info
+    asked = [obj_id for obj_id in context.object_ids if obj_id in infos]
+    read = [obj_id for obj_id in asked if not cached or infos[obj_id].is_diagonal]
+    return [warning for obj_id in read if (warning := context.model(obj_id).warning)]
 
 
 def _check_camera(context: Context, image: ImageId) -> str:

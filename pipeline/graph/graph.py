@@ -84,7 +84,8 @@ class Graph:
 
     def warnings(self) -> list[str]:
         """Results of sanity checks on the detections, one line each."""
-        return detection_warnings(self.context, self.detect())
+        detections, cached = self.detect(), self.context.store.is_complete(self.poses.run_ref())
+        return detection_warnings(self.context, detections, cached=cached)
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""

@@ -29,9 +29,11 @@ class ObjectModel:
     """An object whose pose can be estimated.
 
     ``symmetries``: rigid transforms T_obj_obj (s 4 4, mm), the identity first, continuous symmetries discretised.
+    ``warning``: what is implausible about its files, "" for nothing.
     """
 
     obj_id: int
     mesh: Mesh
     diameter_mm: float
     symmetries: Float[np.ndarray, "s 4 4"] = field(default_factory=lambda: np.eye(4)[None])
+    warning: str = ""

@@ -32,14 +32,21 @@ class GtMask(Detector):
     visible: bool = True
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
-        """Annotations of the scenes, the images (for their size), and the masks that exist."""
+        """Annotations of the scenes, the images (for their size), and the masks that exist.
+
+        Raises BadInput if there is no mask at all, as after BlenderProc.
+        """
         masks = [
             dataset.mask_path(target.scene_id, target.im_id, gt.gt_id, visible=self.visible)
             for target in targets
             for gt in select_instances(dataset, target)
         ]
         files = annotation_paths(dataset, targets) + image_paths(dataset, targets)
-        return files + [path for path in masks if file_exists(path)]
+        existing = [path for path in masks if file_exists(path)]
+        if masks and not existing:
+            needed = "masks (bop_toolkit's calc_gt_masks.py makes them), or detect=json, cnos, gt_bbox"
+            raise BadInput(masks[0].parent, found=f"none of the {len(masks)} masks of the targets", needed=needed)
+        return files + existing
 
     def __call__(
         self, dataset: Dataset, targets: Sequence[Target], descriptors: Descriptors | None = None
