@@ -32,6 +32,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pipeline.cli.cache import cache_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.cli.sweep import FailedJobs, failures_text, record_failed_job
+from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
 from pipeline.configuration import (
     CONF,
     PACKAGE,
@@ -67,20 +68,32 @@ def main() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     # Ctrl-C during a read or write of the store leaves a coroutine of zarr behind.
     warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
+    _silence_resource_trackers()
     logging.raiseExceptions = False  # no traceback when Hydra logs a sweep's job to a closed pipe
     try:
-        if sys.argv[1:2] and sys.argv[1] in COMMANDS:
-            COMMANDS[sys.argv[1]](sys.argv[2:])
-        else:
-            _run_jobs()
+        with stop_on_signals():
+            if sys.argv[1:2] and sys.argv[1] in COMMANDS:
+                with track_files():
+                    COMMANDS[sys.argv[1]](sys.argv[2:])
+            else:
+                _run_jobs()
     except BrokenPipeError:  # the reader of a pipe, such as head, has closed it: not an error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt):
+            stop_children()
         message = _exit_message(error)
         if message is None:
             raise
         sys.exit(message)
+
+
+def _silence_resource_trackers() -> None:
+    """Let joblib's resource trackers, processes of their own, report no semaphores of a sweep that was ended."""
+    silence, given = "ignore:resource_tracker:UserWarning", os.environ.get("PYTHONWARNINGS", "")
+    if silence not in given:
+        os.environ["PYTHONWARNINGS"] = f"{given},{silence}".strip(",")
 
 
 def _exit_message(error: BaseException) -> str | None:
@@ -95,7 +108,7 @@ def _exit_message(error: BaseException) -> str | None:
     if isinstance(error, MemoryError):
         return f"error: out of memory. {RESUME}"
     if isinstance(error, KeyboardInterrupt):
-        return f"interrupted. {RESUME}"
+        return f"{'terminated' if isinstance(error, Terminated) else 'interrupted'}. {RESUME}"
     return _format_error(error) if _raised_by_hydra(error) else None
 
 

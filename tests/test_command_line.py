@@ -11,7 +11,11 @@ from PIL import Image
 
 from pipeline.bop.images import read_mask
 from pipeline.bop.results import read_results
+from pipeline.errors import BadInput
 from pipeline.report.run_records import read_run_records
+from pipeline.stages.render.raycast import Raycast
+from pipeline.synthetic import demo, scenes
+from pipeline.synthetic.demo import DemoConfig
 from pipeline.synthetic.scenes import write_dataset
 
 SMALL = (
@@ -436,3 +440,89 @@ def test_help_names_the_commands_the_variants_and_the_fields(capsys, monkeypatch
     shown = run_dzop(capsys, monkeypatch, "--help").out
     for line in ("dzop cache --help", "match: cosine, masked_cosine, oracle, words", "gallery: 12"):
         assert line in shown
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("dataset.name=my_data", "dataset.name: found 'my_data'"),
+        ("dataset.name='=cmd|calc!A0'", "dataset.name: found '=cmd|calc!A0'"),
+        ("dataset.name=../../x", "dataset.name: found '../../x'"),
+        ("method=a/b", None),
+        ("dataset.split=../test", "dataset.split: found '../test'"),
+    ],
+)
+def test_a_name_that_no_results_file_can_have_is_refused_first(dzop, tmp_path, override, message):
+    ran = dzop(override)
+    assert ran.status == 1
+    assert len(ran.err.strip().splitlines()) == 1, ran.err
+    assert message is None or ran.err.startswith(f"error: {message}, needs at most 80 letters, digits"), ran.err
+    assert not list(tmp_path.glob("cache/*/*"))
+    assert not (tmp_path / "results").exists()
+
+
+def test_pictures_are_drawn_again_when_ground_truth_changes(dzop, tmp_path, scene):
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    options = ("overlays=true", "gallery=1", f"dataset.root={copy}")
+    assert dzop(*options).status == 0
+    pictures = {path: path.read_bytes() for path in results(tmp_path).rglob("*.jpg")}
+    assert dzop(*options).counts()[0]["overlays"] == (0, 2)
+    path = copy / "test" / "000001" / "scene_gt.json"
+    truth = json.loads(path.read_text())
+    for instances in truth.values():
+        for instance in instances:
+            instance["cam_t_m2c"][0] += 30
+    path.write_text(json.dumps(truth))
+    counts = dzop(*options, "detect=gt_mask").counts()[0]
+    assert counts["overlays"] == (2, 0)
+    assert counts["gallery"] == (1, 0)
+    assert all(path.read_bytes() != before for path, before in pictures.items() if path.parent.name == "overlays")
+
+
+def test_a_photograph_overwritten_while_templates_are_rendered_is_named(dzop, tmp_path, scene, monkeypatch):
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    image = copy / "test" / "000001" / "rgb" / "000000.png"
+    content = image.read_bytes()
+    render = Raycast.render
+
+    def overwrite(self, *args):
+        if image.read_bytes() == content:
+            Image.fromarray(255 - np.array(Image.open(image))).save(image)
+        return render(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Raycast, "render", overwrite)
+        ran = dzop("step=estimate", "render=raycast", f"dataset.root={copy}")
+    assert ran.status == 1
+    assert (
+        ran.err
+        == f"error: {image}: found a file that changed during the run, needs one that no one writes to; run again"
+    )
+    image.write_bytes(content)
+    assert dzop("step=estimate", "render=raycast", f"dataset.root={copy}").status == 0
+    poses = json.loads((results(tmp_path) / "poses.json").read_text())["answers"]
+    assert dzop("step=estimate", "render=raycast", "store=memory", "out=other").status == 0
+    fresh = json.loads(next(tmp_path.glob("other/*/*/poses.json")).read_text())["answers"]
+    assert [a["T_cam_obj"] for a in poses] == [a["T_cam_obj"] for a in fresh]
+
+
+def test_a_generated_dataset_of_another_version_is_not_used(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    config = DemoConfig(root=str(tmp_path / "demo"), objects=1, images=1, per_image=1)
+    first = config.open().root
+    assert config.open().root == first
+    monkeypatch.setattr(demo, "GENERATOR_VERSION", 2)
+    monkeypatch.setattr(scenes, "GENERATOR_VERSION", 2)
+    second = config.open().root
+    assert second != first
+    info = json.loads((second / "dataset_info.json").read_text())
+    (second / "dataset_info.json").write_text(json.dumps(info | {"generator": 1}))
+    with pytest.raises(
+        BadInput, match="field generator: found 1, needs what version 2 of the generator writes: delete"
+    ):
+        config.open()
+    (second / "dataset_info.json").unlink()
+    with pytest.raises(BadInput, match="no such file"):
+        config.open()

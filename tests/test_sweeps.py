@@ -134,6 +134,23 @@ def test_a_killed_worker_is_reported_in_one_line_and_a_rerun_resumes(command, st
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_sweep_that_is_told_to_end_ends_its_workers(command, start, tmp_path, number):
+    sweep = start(command("-m", "cluster.count=3,4,5,6,7,8,9,10", *JOBLIB))
+    limit = time.monotonic() + 120
+    while not list((tmp_path / "results" / "rows").glob("*.json")) and time.monotonic() < limit:
+        time.sleep(0.01)
+    children = psutil.Process(sweep.pid).children(recursive=True)
+    assert any("popen_loky" in " ".join(child.cmdline()) for child in children)
+    sweep.send_signal(number)
+    _, stderr = sweep.communicate(timeout=60)
+    assert sweep.returncode == 1
+    assert stderr.strip().splitlines()[-1].endswith("ed. Completed entries are cached; rerun to resume."), stderr
+    assert "Traceback" not in stderr
+    assert not psutil.wait_procs(children, timeout=10)[1]
+
+
+@pytest.mark.slow
 def test_a_killed_sweep_resumes_where_it_stopped(command, dzop, start, tmp_path):
     jobs = "-m", "cluster.count=3,4,5,6,7,8,9,10"
     rows = tmp_path / "results" / "rows"

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pipeline.bop.scene import describe_rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
-from pipeline.io.files import write_atomic
+from pipeline.io.files import read_file, write_atomic
 from pipeline.items.poses import PoseEstimate
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -88,11 +88,7 @@ def read_results(path: Path) -> list[ResultRow]:
 def scan_results(path: Path) -> tuple[list[ResultRow], list[BadInput]]:
     """All valid rows in file order, and the faults of the others. Raises BadInput for an unreadable file."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise BadInput(path, found="no such file", needed="a BOP results csv") from None
-    except OSError as error:
-        raise BadInput(path, found=error, needed="a BOP results csv") from None
+        lines = read_file(path, "a BOP results csv").decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise BadInput(path, found="bytes that are not text", needed="a BOP results csv") from None
     rows: list[ResultRow] = []

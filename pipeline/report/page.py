@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import chain
@@ -14,7 +16,8 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
-from pipeline.io.files import write_atomic
+from pipeline.errors import DzopError
+from pipeline.io.files import write_atomic, write_error
 from pipeline.report.embedded_pictures import GalleryPicture, PictureEmbedder
 from pipeline.report.plotting import Figure
 from pipeline.report.published_tables import published_methods_of, published_tables
@@ -45,12 +48,58 @@ class Part:
 
 
 def write_report(runs: Sequence[RunRecord], out: Path) -> Report:
-    """Write the page of all runs with its figures and tables to ``out/report``; the page is replaced atomically."""
-    folder = out / FOLDER
+    """Write the page of all runs with its figures and tables to ``out/report``.
+
+    An earlier report is replaced once the new one is complete: a full disk leaves it as it was.
+    """
     sections, failed, embedder = sections_of(runs), unresolved_failures(runs), PictureEmbedder(out)
     parts = [_make_part(section, embedder) for section in sections]
-    for name in ("figures", "tables"):  # of the page before; some may be of runs that were removed since
-        shutil.rmtree(folder / name, ignore_errors=True)
+    with _replace_contents(out / FOLDER) as folder:
+        _write_all(folder, runs, parts, failed, embedder)
+    return Report(out / FOLDER / "index.html", _summary(sections, failed, out / FOLDER))
+
+
+@contextmanager
+def _replace_contents(folder: Path) -> Iterator[Path]:
+    """A new folder to write to; its files and folders then replace those of the same names in ``folder``.
+
+    Raises DzopError when the disk is full or cannot be written.
+    """
+    new, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{name}.partial") for name in ("new", "old"))
+    try:
+        try:
+            new.mkdir(parents=True)
+            yield new
+            folder.mkdir(exist_ok=True)
+            old.mkdir()
+            for path in sorted(new.iterdir(), key=Path.is_file):  # the page last, when its figures and tables are there
+                if (folder / path.name).is_dir():
+                    (folder / path.name).rename(old / path.name)
+                path.replace(folder / path.name)
+        finally:
+            _move_back(old, folder)
+            shutil.rmtree(new, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise write_error(folder, error) from None
+    except DzopError as error:
+        raise DzopError(str(error).replace(str(new), str(folder))) from None
+
+
+def _move_back(old: Path, folder: Path) -> None:
+    """Restore what was not replaced because an error came in between."""
+    for path in old.iterdir() if old.is_dir() else ():
+        if not (folder / path.name).exists():
+            path.rename(folder / path.name)
+
+
+def _write_all(
+    folder: Path,
+    runs: Sequence[RunRecord],
+    parts: Sequence[Part],
+    failed: Sequence[RunRecord],
+    embedder: PictureEmbedder,
+) -> None:
     for part in parts:
         _write_figures(folder / "figures" / part.section.folder, part.figures)
         _write_tables(folder / "tables" / part.section.folder, [*chain.from_iterable(part.tables.values())])
@@ -64,7 +113,6 @@ def write_report(runs: Sequence[RunRecord], out: Path) -> Report:
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
     write_atomic(folder / "index.html", text)
-    return Report(folder / "index.html", _summary(sections, failed, folder))
 
 
 def _make_part(section: Section, embedder: PictureEmbedder) -> Part:

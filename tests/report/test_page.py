@@ -1,14 +1,18 @@
+import errno
 import re
+import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from toy_runs import failed_run, toy_run
 
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, DzopError
 from pipeline.report.page import _breakable, write_report
+from pipeline.report.plotting import Figure
 from pipeline.report.run_records import Case, read_run_records, write_run_record
 from pipeline.report.section import Section, sections_of
 
@@ -189,3 +193,44 @@ def test_files_of_removed_runs_are_deleted_with_the_old_page(runs, tmp_path):
 def test_a_table_of_many_columns_has_intervals_below_their_figures(built):
     _, text = built
     assert re.search(r"<td>0\.\d{3}<br>\(0\.\d{3} to 0\.\d{3}\)</td>", text)
+
+
+def fail_at(monkeypatch: pytest.MonkeyPatch, number: int) -> list[str]:
+    """Let the n-th write of the report fail as on a full disk; returns what was written."""
+    writes: list[str] = []
+
+    def fail(owner, name: str) -> None:
+        original = getattr(owner, name)
+
+        def write(self, *args, **kwargs):
+            writes.append(f"{name} {self}")
+            if len(writes) == number:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return original(self, *args, **kwargs)
+
+        monkeypatch.setattr(owner, name, write)
+
+    for owner, name in ((Figure, "save"), (Path, "write_bytes"), (Path, "mkdir"), (Path, "rename"), (Path, "replace")):
+        fail(owner, name)
+    return writes
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_report_that_was_there(runs, tmp_path, monkeypatch):
+    page(runs[:2], tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with monkeypatch.context() as patch:
+        writes = fail_at(patch, 0)
+        page(runs[:1], tmp_path / "other")
+    shutil.rmtree(tmp_path / "other")
+    last_file = len(writes) - 8  # then the folders and the page are put in their places
+    for number in (1, last_file // 2, *range(last_file, len(writes) + 1)):
+        with monkeypatch.context() as patch:
+            fail_at(patch, number)
+            with pytest.raises(DzopError, match=r"report.*: the disk is full; make room"):
+                write_report(runs[:1], tmp_path)
+        now = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        assert now[tmp_path / "report" / "index.html"] == before[tmp_path / "report" / "index.html"]
+        assert {path.parent.name for path in now} >= {"report", "figures", "tables"} & {p.parent.name for p in before}
+        assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".partial")]
+        assert now == before or number > last_file + 3, writes[number - 1]
