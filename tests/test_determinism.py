@@ -8,9 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from markupsafe import escape
 
+from pipeline.machine import describe_machine, machine_text
 from pipeline.parallel import one_thread_per_kernel, ordered_map, use_threads, worker_count
-from pipeline.store import LocalStoreConfig, Store
+from pipeline.report.run_records import read_run_records
+from pipeline.store import LocalStoreConfig, Store, make_ref
+from pipeline.store.admin import list_entries
 from pipeline.synthetic.scenes import write_dataset
 from tests.command import run_dzop
 from tests.same_bytes import contents, poses
@@ -133,3 +137,33 @@ def test_sums_over_blocks_do_not_depend_on_threads(threads):
     serial = compute()
     use_threads(threads)
     assert compute() == serial
+
+
+def test_entries_record_what_made_them_and_the_report_and_the_command_show_it(
+    results, scene, tmp_path, capsys, monkeypatch
+):
+    small = ("render.count=8", "render.size=64", "method=dzop", "extract=pixels", "threads=1")
+    results("run", "dataset=bop", "dataset.name=toy", f"dataset.root={scene}", *small)
+    root = f"{tmp_path}/run/cache"
+    store = Store(LocalStoreConfig(root=root))
+    expected = describe_machine("cpu")
+    assert expected["torch"] == torch.__version__
+    for entry in list_entries(store):
+        assert entry.made_by == expected
+    listed = run_dzop(capsys, monkeypatch, "cache", "ls", "--long", "--root", root)
+    assert listed.out.count(f"made by {machine_text(expected)}") == len(list_entries(store))
+    (record,) = read_run_records(tmp_path / "run" / "out")
+    assert record.machines == (machine_text(expected),)
+    assert run_dzop(capsys, monkeypatch, "step=report", f"out={tmp_path}/run/out").status == 0
+    page = (tmp_path / "run" / "out" / "report" / "index.html").read_text()
+    assert f"Computed by {escape(machine_text(expected))}." in page
+
+
+def test_an_entry_without_this_record_is_still_complete_and_made_by_unknown(tmp_path, capsys, monkeypatch):
+    store = Store(LocalStoreConfig(root=f"{tmp_path}/cache"))
+    ref = make_ref("poses", {"kind": "poses"}, {})
+    store.put_document(ref, {"answers": []}, rows=0)
+    assert store.is_complete(ref)
+    assert store.maker(ref) == {}
+    listed = run_dzop(capsys, monkeypatch, "cache", "ls", "--long", "--root", f"{tmp_path}/cache")
+    assert "made by unknown" in listed.out

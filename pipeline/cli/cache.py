@@ -8,6 +8,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from pipeline.errors import DzopError
+from pipeline.machine import machine_text
 from pipeline.progress import format_bytes
 from pipeline.store import LocalStoreConfig, S3StoreConfig, Store
 from pipeline.store.admin import EntryInfo, check_is_store, collect_garbage, find_entry, list_entries, verify
@@ -28,6 +29,7 @@ def cache_command(arguments: list[str]) -> None:
     else:
         entry = find_entry(store, options.key)
         print(f"{store.place}/{entry.path}")
+        print(f"made by {machine_text(entry.made_by) if entry.made_by else 'unknown'}")
         print(json.dumps(entry.made_from, indent=2, sort_keys=True))
 
 
@@ -37,7 +39,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="dzop cache", description="Inspect, verify and clean up the feature store.")
     commands = parser.add_subparsers(dest="command", required=True)
     ls = commands.add_parser("ls", parents=[root], help="list entries: state, rows, size, age and path")
-    ls.add_argument("--long", action="store_true", help="also print what each entry was made from")
+    ls.add_argument(
+        "--long",
+        action="store_true",
+        help="also print what each entry was made from and by",
+    )
     commands.add_parser("du", parents=[root], help="print the size of each folder")
     commands.add_parser("verify", parents=[root], help="check every byte; damaged entries are marked incomplete")
     gc = commands.add_parser("gc", parents=[root], help="delete incomplete entries, and optionally old ones")
@@ -71,6 +77,7 @@ def _print_entries(entries: list[EntryInfo], *, long: bool) -> None:
         print(f"{entry.state:<11}{entry.rows:>6}{size:>10}{age:>8}  {entry.path}")
         if long:
             print(f"{'':37}made from {json.dumps(entry.made_from, sort_keys=True)}")
+            print(f"{'':37}made by {machine_text(entry.made_by) if entry.made_by else 'unknown'}")
 
 
 def _format_age(hours: float | None) -> str:

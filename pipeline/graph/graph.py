@@ -24,6 +24,7 @@ from pipeline.graph.tasks import Counts, Task
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
+from pipeline.machine import describe_machine, machine_text
 from pipeline.parallel import one_thread_per_kernel
 from pipeline.scoring import Scorer
 
@@ -41,7 +42,7 @@ class Graph:
     def check(self) -> None:
         """Check device, budgets, weights and layers before anything is computed. Raises BadInput."""
         runtime, stages = self.context.runtime, self.context.stages
-        runtime.torch_device()
+        self.context.store.made_by = describe_machine(runtime.torch_device())
         _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for what is not a size
         stages.fuse.check(stages.extract.model)
         check_layers(stages)
@@ -105,6 +106,16 @@ class Graph:
     def replayer(self) -> Replayer:
         """Recomputes how an answer came about, from stored features."""
         return Replayer(self.templates, self.queries, self.poses)
+
+    def machines(self) -> list[str]:
+        """Each machine, with its versions, that computed templates, features or poses of this run, as one line."""
+        templates, queries, context = self.templates, self.queries, self.context
+        refs = [templates.templates(obj_id) for obj_id in context.object_ids]
+        refs += [templates.features(obj_id, layer) for obj_id in context.object_ids for layer in context.stages.layers]
+        refs += [queries.features(image, layer) for image in context.image_ids for layer in context.stages.layers]
+        refs += [self.poses.poses(group) for group in self.poses.groups]
+        makers = [context.store.maker(ref) for ref in refs]
+        return sorted({machine_text(maker) for maker in makers if maker})
 
     @one_thread_per_kernel()
     def run_item(self, task: str, item: Any) -> Counts:

@@ -81,6 +81,7 @@ def _make_record(
         scores=evaluation.scored.scores,
         templates=evaluation.templates,
         cases=tuple(cases),
+        machines=tuple(folder.graph.machines()),
     )
 
 

@@ -57,8 +57,8 @@ class RunRecord:
     were computed and reused, and seconds. ``times_s``: by stage, median seconds of a target. ``failures``: (stage,
     reason, count) of targets without a pose. ``templates``: errors of the matched templates by (scene_id, im_id,
     obj_id, gt_id). ``metrics``: average recalls and other summary figures. ``folder``: where csv, poses.json and
-    pictures are, relative to ``out``. A failed run has ``error`` and its command-line ``overrides``, and defaults for
-    everything it did not reach.
+    pictures are, relative to ``out``. ``machines``: what computed the entries it used, one line each. A failed run has
+    ``error`` and its command-line ``overrides``, and defaults for everything it did not reach.
     """
 
     id: str
@@ -84,6 +84,7 @@ class RunRecord:
     scores: Scores | None = None
     templates: Mapping[tuple[int, int, int, int], TemplateError] = field(default_factory=dict)
     cases: tuple[Case, ...] = ()
+    machines: tuple[str, ...] = ()
 
     def require_scores(self) -> Scores:
         """The scores of a run that was evaluated."""
@@ -195,6 +196,8 @@ def _check_types(content: Mapping[str, Any]) -> None:
     for name in ("estimates", "bytes_per_object"):
         if not isinstance(content.get(name, 0), (int, float)):
             raise TypeError(f"{name} is not a number")
+    if not all(isinstance(machine, str) for machine in content.get("machines", ())):
+        raise TypeError("machines are not strings")
     counts = content["counts"].values()
     if not all(isinstance(count, dict) and {"computed", "reused"} <= set(count) for count in counts):
         raise TypeError("counts lack computed and reused")
@@ -225,6 +228,7 @@ def _from_json(content: dict[str, Any]) -> RunRecord:
     scores = content.pop("scores")
     templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in content.pop("templates")}
     content["overrides"] = tuple(content["overrides"])
+    content["machines"] = tuple(content.get("machines", ()))
     failures = tuple((stage, reason, count) for stage, reason, count in content.pop("failures"))
     return RunRecord(
         **content,

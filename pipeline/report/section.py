@@ -80,6 +80,11 @@ class Section:
         """Notices of the feature extractors, such as that weights are random."""
         return list(dict.fromkeys(f"{run.method}: {run.notice}" for run in self.runs if run.notice))
 
+    @property
+    def machines(self) -> list[str]:
+        """What computed the runs: versions, device and CPU, one line for each kind."""
+        return sorted({machine for run in self.runs for machine in run.machines})
+
     @cached_property
     def methods(self) -> list[tuple[str, RunRecord]]:
         """One run per method, the base run first; of each other method the run with the fewest changed settings."""

@@ -22,7 +22,10 @@ COMPLETE, INCOMPLETE, NEWER, FOREIGN = "complete", "incomplete", "newer", "forei
 
 @dataclass(frozen=True)
 class EntryInfo:
-    """One entry as ``dzop cache ls`` lists it. ``age_h``: hours since it was completed, None if it never was."""
+    """One entry as ``dzop cache ls`` lists it. ``age_h``: hours since it was completed, None if it never was.
+
+    ``made_by``: the process that completed it (``pipeline.machine``), empty for older entries.
+    """
 
     path: str
     state: str
@@ -31,6 +34,7 @@ class EntryInfo:
     age_h: float | None
     kind: str
     made_from: Any
+    made_by: Mapping[str, str]
 
     @property
     def complete(self) -> bool:
@@ -71,6 +75,7 @@ def _describe(store: Store, path: str) -> EntryInfo:
         age_h=None if record is None else _hours_since(record["at"]),
         kind=str(recipe.get("kind", "?")) if isinstance(recipe, dict) else "?",
         made_from=made_from,
+        made_by={} if record is None else record.get("made_by", {}),
     )
 
 

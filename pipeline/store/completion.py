@@ -46,10 +46,12 @@ def complete_attributes(
     nbytes: int,
     folder: str = "",
     chunks: Mapping[str, str] | None = None,
+    made_by: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Attributes of a complete entry: its identity, document and completion record. Write them last, in one request.
 
     ``folder``: where its arrays are, relative to the entry. ``chunks``: array name -> checksums of its rows in hex.
+    ``made_by``: the process that completes it, as ``machine.describe_machine`` gives it.
     """
     record = {
         "rows": rows,
@@ -60,6 +62,7 @@ def complete_attributes(
         "document": digest(document),
         "folder": folder,
         "chunks": dict(chunks or {}),
+        "made_by": dict(made_by or {}),
         "writer": token_hex(8),  # so that no two records are equal
     }
     known = identity(ref)

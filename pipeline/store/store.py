@@ -58,12 +58,16 @@ class FillResult:
 
 
 class Store:
-    """The feature store. Only pipeline/graph uses it; a step computes the same values with and without it."""
+    """The feature store. Only pipeline/graph uses it; a step computes the same values with and without it.
+
+    ``made_by`` describes this process (``pipeline.machine``) in the entries that it completes.
+    """
 
     def __init__(self, config: StoreConfig, announce: Callable[[str], None] = lambda text: None) -> None:
         self.config = config
         self.backend: Backend = config.open()
         self.announce = announce
+        self.made_by: Mapping[str, str] = {}
         self.lease: Lease | None = None
         self._used: dict[Ref, Any] = {}
         self._has_marker = False
@@ -108,6 +112,10 @@ class Store:
         """Uncompressed bytes of a complete entry, None when it is not complete."""
         record = self._record(ref)
         return None if record is None else int(record["bytes"])
+
+    def maker(self, ref: Ref) -> Mapping[str, str]:
+        """``made_by`` of a complete entry; empty if it is not complete, or older than this record."""
+        return (self._record(ref) or {}).get("made_by", {})
 
     def _record(self, ref: Ref) -> Mapping[str, Any] | None:
         attributes = self.attributes(ref.path)
@@ -167,7 +175,7 @@ class Store:
             if self.is_complete(ref):
                 return
             attributes = complete_attributes(
-                ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document))
+                ref, {}, document, rows=rows, time_s=time_s, nbytes=len(canonical(document)), made_by=self.made_by
             )
             self._mark_root()
             open_or_create_group(self.backend, ref, identity(ref), self.announce)
@@ -207,7 +215,7 @@ class Store:
                     self._check_used()
             time_s = time.perf_counter() - start
             for writer in writers:
-                writer.complete(dict(document or {}), time_s)
+                writer.complete(dict(document or {}), time_s, self.made_by)
         return FillResult(computed, rows - computed, time_s)
 
     def _mark_root(self) -> None:

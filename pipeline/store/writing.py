@@ -203,7 +203,7 @@ class EntryWriter:
     def _hex_checksums(self, rows: Sequence[int]) -> dict[str, str]:
         return {name: to_hex(checksums, rows) for name, checksums in self.checksums.items()}
 
-    def complete(self, document: Any, time_s: float) -> None:
+    def complete(self, document: Any, time_s: float, made_by: Mapping[str, str]) -> None:
         """Write the completion record, unless another process has completed the entry with rows of its own.
 
         Raises DamagedEntry when another process removed rows meanwhile.
@@ -216,7 +216,7 @@ class EntryWriter:
         nbytes = sum(layout.nbytes(self.rows) for layout in self.layouts.values())
         attributes = complete_attributes(
             self.ref, self.arrays, document, rows=self.rows, time_s=time_s, nbytes=nbytes,
-            folder=self.folder, chunks=self._hex_checksums(range(self.rows)),
+            folder=self.folder, chunks=self._hex_checksums(range(self.rows)), made_by=made_by,
         )  # fmt: skip
         write_attributes(self.backend.zarr, self.ref.path, attributes)
         if self._has_notes:
