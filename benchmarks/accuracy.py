@@ -1,4 +1,4 @@
-"""Accuracy of the embedded model compared with control features, as tables in Markdown.
+"""Accuracy of the embedded model compared with baseline features, as tables in Markdown.
 
 The procedural test objects use a seed that was not used for training or for choosing options. With --lmo, the same
 table is made on photographs. Runs are cached; run the same command again to resume an interrupted benchmark.

@@ -11,7 +11,8 @@ from benchmarks.measure import Measurement, time_interleaved
 from pipeline.functional.camera import unproject
 from pipeline.items.objects import Mesh
 from pipeline.stages.render.cameras import bounding_sphere, subpixels
-from pipeline.stages.render.raycast import Raycast, _embree
+from pipeline.stages.render.ray_mesh import _import_embree
+from pipeline.stages.render.raycast import Raycast
 from pipeline.synthetic.objects import make_object
 
 _VIEWS = 10
@@ -53,7 +54,7 @@ def add_texture(mesh: Mesh) -> Mesh:
 
 def bare_embree(mesh: Mesh, K: np.ndarray, T_cam_obj: np.ndarray, size_hw: tuple[int, int]) -> Callable[[], object]:
     """Casts precomputed rays, four per pixel of the object's bounding box, without shading."""
-    scene, triangles = _embree()
+    scene, triangles = _import_embree()
     built = scene(robust=True)
     centre, _ = bounding_sphere(mesh)
     geometry = triangles(built, (mesh.vertices - centre).astype(np.float32), mesh.faces.astype(np.int32))

@@ -1,4 +1,4 @@
-"""The control with random weights: equal on every machine; Stable Diffusion's architecture with other widths."""
+"""The baseline with random weights: equal on every machine; Stable Diffusion's architecture with other widths."""
 
 import hashlib
 

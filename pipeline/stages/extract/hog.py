@@ -1,4 +1,4 @@
-"""crops -> histograms of oriented gradients: a control without weights (Dalal and Triggs, CVPR 2005)."""
+"""crops -> histograms of oriented gradients: a baseline without weights (Dalal and Triggs, CVPR 2005)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""crops -> feature maps of a small U-Net of Stable Diffusion's architecture with random weights: a control.
+"""crops -> feature maps of a small U-Net of Stable Diffusion's architecture with random weights: a baseline.
 
 It is not Stable Diffusion and is untrained: its scores show how far random convolutions get.
 """
@@ -28,7 +28,7 @@ Width = Annotated[int, Field(ge=_GROUPS, multiple_of=_GROUPS)]
 
 @spec
 class RandomSD(DiffusionFeatures):
-    """Random weights, drawn in memory from ``weights_seed``: a control, not Stable Diffusion.
+    """Random weights, drawn in memory from ``weights_seed``: a baseline, not Stable Diffusion.
 
     Uses the same diffusers classes and 12 decoder blocks as SD, with other widths: ``channels`` of the U-Net's levels
     and ``vae_channels`` of the encoder's. The number of encoder levels sets the VAE's factor (3: 4 px per latent cell).
