@@ -50,7 +50,7 @@ def check_make(arguments: list[str]) -> None:
 
 
 def check_extras(arguments: list[str]) -> None:
-    named = re.findall(r"^dzop\[([\w,-]+)\]$", " ".join(arguments), re.MULTILINE)
+    named = re.findall(r"(?:^|\s)(?:dzop|\.)\[([\w,-]+)\]", " ".join(arguments))
     assert all(extra in EXTRAS for names in named for extra in names.split(","))
 
 
