@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,7 @@ def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
 
 
 PIL.Image.MAX_IMAGE_PIXELS = MAX_MEGAPIXELS * 10**6  # PIL's own limit of 179 would call a large photograph an attack
+warnings.filterwarnings("ignore", category=PIL.Image.DecompressionBombWarning)  # check_megapixels reports it
 _ORIENTATION_TAG = 0x0112
 _UPRIGHT = {
     2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Num, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 
 from pipeline.errors import BadInput
 
@@ -26,7 +26,7 @@ def check_megapixels(width: int, height: int, path: Path) -> None:
         raise BadInput(path, found=found, needed=f"at most {MAX_MEGAPIXELS}: scale the image down, and K with it")
 
 
-def scale_to_8_bits(values: Num[np.ndarray, "H W"], path: Path) -> UInt8[np.ndarray, "H W"]:
+def scale_to_8_bits(values: Shaped[np.ndarray, "H W"], path: Path) -> UInt8[np.ndarray, "H W"]:
     """Grey values of more than 8 bits -> 0..255.
 
     Integers are taken to have the smallest usual number of bits (8, 10, 12, 14, 16) that holds the largest of them, so
@@ -45,7 +45,7 @@ def scale_to_8_bits(values: Num[np.ndarray, "H W"], path: Path) -> UInt8[np.ndar
 
 
 def select_object(
-    values: Num[np.ndarray, "H W *c"], path: Path, *, label: int | None = None
+    values: Shaped[np.ndarray, "H W *c"], path: Path, *, label: int | None = None
 ) -> Bool[np.ndarray, "H W"]:
     """The pixels of the object in a mask.
 
@@ -58,7 +58,7 @@ def select_object(
         raise BadInput(path, found="negative or undefined values", needed="a mask: black outside the object")
     if label is not None:
         return _select_label(grey, label, path)
-    largest = grey.max(initial=0)
+    largest = float(grey.max(initial=0))
     object_px = np.count_nonzero(grey)
     if object_px == 0 or (np.count_nonzero(grey == largest) == object_px and _one_colour(values, grey > 0)):
         return np.asarray(grey > 0)
@@ -69,7 +69,7 @@ def select_object(
     raise _labels_error(values, grey, path)
 
 
-def _has_plateau(grey: Num[np.ndarray, "H W"], largest: float) -> bool:
+def _has_plateau(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
     """Whether a region between black and white is flat, as labels are and soft edges are not."""
     values = grey.astype(np.float32)
     square = np.ones((3, 3), np.uint8)
@@ -77,7 +77,7 @@ def _has_plateau(grey: Num[np.ndarray, "H W"], largest: float) -> bool:
     return bool((flat & (values > NEAR * largest) & (values < (1 - NEAR) * largest)).any())
 
 
-def _one_colour(values: Num[np.ndarray, "H W *c"], inside: Bool[np.ndarray, "H W"]) -> bool:
+def _one_colour(values: Shaped[np.ndarray, "H W *c"], inside: Bool[np.ndarray, "H W"]) -> bool:
     """Whether most pixels inside have nearly one colour."""
     if values.ndim == 2 or not inside.any():
         return True
@@ -86,14 +86,14 @@ def _one_colour(values: Num[np.ndarray, "H W *c"], inside: Bool[np.ndarray, "H W
     return bool(np.mean(off <= COLOUR_NEAR * max(colours.max(), 1)) > 0.9)
 
 
-def _select_label(grey: Num[np.ndarray, "H W"], label: int, path: Path) -> Bool[np.ndarray, "H W"]:
+def _select_label(grey: Shaped[np.ndarray, "H W"], label: int, path: Path) -> Bool[np.ndarray, "H W"]:
     mask = np.asarray(grey == label)
     if not mask.any():
         raise BadInput("dataset.mask_label", found=label, needed=f"one of the labels of {path}: {_list_labels(grey)}")
     return mask
 
 
-def _labels_error(values: Num[np.ndarray, "H W *c"], grey: Num[np.ndarray, "H W"], path: Path) -> BadInput:
+def _labels_error(values: Shaped[np.ndarray, "H W *c"], grey: Shaped[np.ndarray, "H W"], path: Path) -> BadInput:
     needed = "the mask of one object, or dataset.mask_label=N to choose a label"
     if values.ndim == 3 and not (values == values[..., :1]).all():
         colours = len(np.unique(values[grey > 0].reshape(-1, values.shape[-1])[:: max(1, grey.size // 10**6)], axis=0))
@@ -101,7 +101,7 @@ def _labels_error(values: Num[np.ndarray, "H W *c"], grey: Num[np.ndarray, "H W"
     return BadInput(path, found=f"several values beside black: {_list_labels(grey)}", needed=needed)
 
 
-def _list_labels(grey: Num[np.ndarray, "H W"]) -> str:
+def _list_labels(grey: Shaped[np.ndarray, "H W"]) -> str:
     labels, counts = np.unique(grey[grey > 0], return_counts=True)
     shown = [f"{label:g} ({count} pixels)" for label, count in zip(labels, counts, strict=True)][:MAX_LABELS_SHOWN]
     more = len(labels) - len(shown)
