@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from graph.perturbation import BASE, TinyRun, digest_entries, variant
-from graph.test_keys import FILES, SCENE, bop, change_tensor, field_of, pixel, stages_of, write_dataset
+from graph.test_keys import FILES, SCENE, bop, change_tensor, field_of, stages_of, write_dataset
 from make_vit import write_vit
 
 from pipeline.errors import BadInput
@@ -20,7 +20,7 @@ from pipeline.io.digests import FileChanged, track_files
 from pipeline.store import MemoryStoreConfig, Store
 
 CHANGES: dict[str, tuple[str, str, Callable[[Path], None]]] = {  # which stages, which file, its change
-    "image": ("masks", f"{SCENE}/rgb/000000.png", pixel(f"{SCENE}/rgb/000000.png")),
+    "image": ("masks", f"{SCENE}/rgb/000000.png", FILES["image"]),
     "mask": ("masks", f"{SCENE}/mask_visib/000000_000001.png", FILES["visible mask"]),
     "missing mask": ("masks", f"{SCENE}/mask_visib/000000_000001.png", FILES["missing mask"]),
     "depth": ("true correspondences", f"{SCENE}/depth/000000.png", FILES["depth"]),
