@@ -86,6 +86,11 @@ class Dataset:
         """A box from the config instead of a file; it is part of the keys of detections."""
         return None
 
+    @property
+    def given_mask_label(self) -> int | None:
+        """The object's value in a mask that labels several; it is part of the keys of detections."""
+        return None
+
     def scene(self, scene_id: int) -> Scene:
         """The scene; its JSON files are read once."""
         if scene_id not in self._scenes:

@@ -11,7 +11,7 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.bop.pixels import MAX_MEGAPIXELS, check_megapixels, scale_to_8_bits, select_object
+from pipeline.bop.pixels import DEEP_GREY_VERSION, MAX_MEGAPIXELS, check_megapixels, scale_to_8_bits, select_object
 from pipeline.errors import BadInput
 from pipeline.io.digests import file_digest, unchanged_files
 from pipeline.io.files import IMAGE_FORMATS, read_file
@@ -73,24 +73,27 @@ _UPRIGHT = {
 _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 
 
-def image_digest(path: Path) -> str:
-    """Digest of an image as it is read: of its file, and of its EXIF orientation where the file has one.
+def image_digest(path: Path, *, photograph: bool = True) -> str:
+    """Digest of an image as it is read: of its file, and of the rules that only some files need.
 
-    What the readers above do to some files only belongs into ``_special_rules``, so that the keys of others stay.
+    ``photograph``: whether ``read_rgb`` reads it. Rules belong into ``_special_rules``, so that other files keep their
+    keys; those of masks are in the version of the detectors.
     """
     content = file_digest(path)
     try:
         with unchanged_files([path]), _open_header(path) as image:
-            rules = _special_rules(image)
+            rules = _special_rules(image, photograph=photograph)
     except _BROKEN:
         rules = []
     return digest([content, rules]) if rules else content
 
 
-def _special_rules(image: PIL.Image.Image) -> list[str]:
-    """What is done to this image that is not done to a plain one; with a number where the rule has changed."""
+def _special_rules(image: PIL.Image.Image, *, photograph: bool) -> list[str]:
+    """What is done to this image that is not done to a plain one. Raise the number of a rule when it changes."""
     orientation = _read_orientation(image)
-    return [] if orientation not in _UPRIGHT else [f"EXIF orientation {orientation}"]
+    rules = [] if orientation not in _UPRIGHT else [f"EXIF orientation {orientation}"]
+    is_deep_grey = photograph and image.mode[0] in "IF"
+    return [*rules, f"more than 8 bits, rule {DEEP_GREY_VERSION}"] if is_deep_grey else rules
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -139,6 +139,11 @@ class Photo(Dataset):
         """The box, if one is given instead of a mask."""
         return self.bbox_xyxy
 
+    @property
+    def given_mask_label(self) -> int | None:
+        """The label, if one is given."""
+        return self.mask_label
+
     def image(self, scene_id: int, im_id: int) -> Image:
         """The photograph."""
         return Image(scene_id, im_id, read_rgb(self.photo_path), self.camera_matrix)

@@ -33,8 +33,12 @@ class DetectionNodes:
         """All detections of the targets."""
         recipe = {"kind": "detections", "detect": self.context.stages.detect.recipe()}
         targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.context.targets]
-        given_box = None if self.proposals else self.context.dataset.given_bbox_xyxy
-        return make_ref("detections", recipe, self._sources() | {"targets": digest([targets, given_box])})
+        asked: list[Any] = [targets, None]
+        if not self.proposals:
+            data = self.context.dataset
+            label = [] if data.given_mask_label is None else [data.given_mask_label]
+            asked = [targets, data.given_bbox_xyxy, *label]
+        return make_ref("detections", recipe, self._sources() | {"targets": digest(asked)})
 
     def _sources(self) -> dict[str, str]:
         """Digests of what the detector reads: files, or features of proposals and templates."""
@@ -90,6 +94,7 @@ def _digest_sources(files: Sequence[Path], root: Path) -> str:
         name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
         while name in digest_of:
             name += "'"  # a photograph and its mask often have one name, in different folders
-        digest_of[name] = file_digest(path) if path.suffix in (".json", ".gz") else image_digest(path)
+        is_json = path.suffix in (".json", ".gz")
+        digest_of[name] = file_digest(path) if is_json else image_digest(path, photograph=False)
     lines = "".join(f"{name}\0{content}\n" for name, content in sorted(digest_of.items()))
     return sha256(lines.encode()).hexdigest()

@@ -78,7 +78,7 @@ class ScoreNodes:
         scorer, data = self.scorer, self.context.dataset
         if scorer.no_vsd:
             return scorer.no_vsd
-        files = [image_digest(data.depth_path(*image)) for image in scorer.images]
+        files = [image_digest(data.depth_path(*image), photograph=False) for image in scorer.images]
         scales = [data.scene(scene_id).camera(im_id).depth_scale for scene_id, im_id in scorer.images]
         return digest([files, scales, DEPTH_VERSION])
 

@@ -353,15 +353,22 @@ def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property
     perturbations = Perturbations(photo(root, **given))
     perturbations.contents()
     box = {"mask": None, "bbox": (15.0, 17.0, 9.0, 12.0)}
-    for name, changed in {
+    changes: dict[str, dict[str, Any]] = {
         **{f"K[{i}]": {"K": tuple(v + 0.25 * (i == k) for k, v in enumerate(K))} for i in range(4)},
         "scale": {"scale": 1.01},
         "box": box,
         "other box": box | {"bbox": (15.0, 17.0, 9.0, 13.0)},
         "other mesh": {"mesh": str(root / "models" / "obj_000001.ply")},
         "name": {"name": "other"},
-    }.items():
+        "mask_label": {"mask": write_labels(root / "labels.png"), "mask_label": 2},
+        "image": {"image": str(root / SCENE / "rgb" / "000003.png")},
+    }
+    for name, changed in changes.items():
         perturbations.change(name, photo(root, **(given | changed)))
+    assert {field.name for field in fields(PhotoConfig)} == {name for changed in changes.values() for name in changed}
+    labelled = Perturbations(photo(root, **(given | changes["mask_label"] | {"mask_label": 1})))
+    labelled.change("mask_label", photo(root, **(given | changes["mask_label"])))
+    report(labelled, "label of a mask", record_property)
     files: dict[str, Callable[[Path], None]] = {
         "image": inverted(f"{SCENE}/rgb/000000.png"),
         "mask": pixel(f"{SCENE}/mask_visib/000000_000000.png"),
@@ -376,6 +383,14 @@ def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property
         edit(other)
         perturbations.change(name, photo(other, mesh=str(other / "models" / "box.obj")), thorough=True)
     report(perturbations, "photograph", record_property)
+
+
+def write_labels(path: Path) -> str:
+    """A mask that labels two objects."""
+    values = np.zeros((48, 64), np.uint8)
+    values[10:20, 10:25], values[25:40, 30:50] = 1, 2
+    PIL.Image.fromarray(values).save(path)
+    return str(path)
 
 
 def write_obj(path: Path) -> Path:
@@ -400,6 +415,12 @@ def test_photograph_and_mask_of_one_file_name_are_both_in_the_key(tmp_path: Path
     pixel("shot.png")(image.parent)
     with track_files():
         assert run.graph()[0].detections.ref.key != before
+
+
+def test_rule_for_more_than_8_bits_is_in_the_key_of_photographs_alone(tmp_path: Path):
+    PIL.Image.fromarray(np.full((30, 40), 4095, np.uint16)).save(tmp_path / "deep.png")
+    assert image_digest(tmp_path / "deep.png") != file_digest(tmp_path / "deep.png")
+    assert image_digest(tmp_path / "deep.png", photograph=False) == file_digest(tmp_path / "deep.png")
 
 
 @pytest.mark.parametrize("orientation", [2, 3, 6, 8])

@@ -27,7 +27,7 @@ class GtMask(Detector):
     """
 
     kind: ClassVar[str] = "detect.gt_mask"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     visible: bool = True
 

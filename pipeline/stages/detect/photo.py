@@ -22,7 +22,7 @@ class PhotoMask(Detector):
     """The mask or box given to ``dataset=photo``, with score 1."""
 
     kind: ClassVar[str] = "detect.photo"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """The photograph, and its mask file if given."""
