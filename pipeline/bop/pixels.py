@@ -13,7 +13,7 @@ from pipeline.errors import BadInput
 MAX_MEGAPIXELS = 300
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 DEEP_GREY_VERSION = 2
-"""Version of ``scale_to_8_bits``; in version 1 white was 65535. ``select_object`` is in the version of the detectors."""
+"""Version of ``scale_to_8_bits``; in version 1 white was 65535. ``select_object`` counts as part of the detectors."""
 NEAR = 0.03  # of the largest value: how far compression moves a flat region from black or white
 SMALLEST_WHITE = 128  # integers below it are labels, not intensities
 COLOUR_NEAR = 0.4  # of the largest value: how far compression moves the colour of a mask
