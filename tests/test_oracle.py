@@ -35,7 +35,7 @@ from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.objects import make_object
 from pipeline.synthetic.scenes import write_dataset
 
-FULL = replace(PAPER, render=Raycast(count=60), extract=Coordinates())
+FULL = replace(PAPER, render=Raycast(count=80), extract=Coordinates())
 ABLATIONS = {
     "whole route": {},
     "clusters off": {"cluster": One()},
