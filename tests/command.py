@@ -1,8 +1,10 @@
-"""Runs the command line in this process, as a shell would, and gives back what it printed."""
+"""Run the command line in this process, without the seconds that a new one takes to import."""
 
+import io
 import re
 import signal
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 
 import pytest
@@ -11,8 +13,8 @@ from pipeline.__main__ import main
 
 
 @dataclass(frozen=True)
-class Ran:
-    status: int | str | None
+class CommandResult:
+    status: int | None
     out: str
     err: str
 
@@ -27,19 +29,37 @@ class Ran:
         return tables
 
 
-def run_dzop(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Ran:
+def run_dzop(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> CommandResult:
+    """Run ``dzop`` with the arguments."""
     monkeypatch.setattr(sys, "argv", ["dzop", *arguments])
     capsys.readouterr()
-    status: int | str | None = 0
+    status = _exit_status()
+    printed = capsys.readouterr()
+    return _result(status, printed.out, printed.err)
+
+
+def run_dzop_for_module(*arguments: str) -> CommandResult:
+    """As run_dzop, for fixtures of a module or a session."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["dzop", *arguments])
+        status = _exit_status()
+    return _result(status, out.getvalue(), err.getvalue())
+
+
+def _exit_status() -> int | str | None:
     try:
         main()
     except SystemExit as stop:
-        status = stop.code
-    printed = capsys.readouterr()
-    err = printed.err + (status if isinstance(status, str) else "")
-    return Ran(1 if isinstance(status, str) else status, printed.out, err)
+        return stop.code
+    return 0
 
 
-def heeds_ctrl_c() -> None:
-    """For a child before it starts: what a shell runs in the background ignores SIGINT, and so do its children."""
+def _result(status: int | str | None, out: str, err: str) -> CommandResult:
+    """The result as a shell sees it: a text given to sys.exit is printed, and the status is 1."""
+    return CommandResult(1, out, err + status) if isinstance(status, str) else CommandResult(status, out, err)
+
+
+def restore_ctrl_c() -> None:
+    """Let a child process react to SIGINT (``preexec_fn``): below a shell's background job it would ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 from huggingface_hub.errors import LocalEntryNotFoundError
 
 from pipeline.backbones.batching import Footprint, compute_batch_size
@@ -37,7 +37,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dzop(capsys, monkeypatch, tmp_path, scene):
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str) -> Ran:
+    def run(*arguments: str) -> CommandResult:
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", "evaluate.vsd=false")
         return run_dzop(capsys, monkeypatch, *dataset, *SMALL, *QUIET, *arguments)
 

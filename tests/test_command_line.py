@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 from PIL import Image
 
 from pipeline.bop.images import read_mask
@@ -24,6 +24,7 @@ SMALL = (
     "method=dzop",
     "extract=hog",
     "overlays=false",
+    "gallery=0",
     "runtime.progress=false",
     "runtime.device=cpu",
 )
@@ -40,7 +41,7 @@ def scene(tmp_path_factory) -> Path:
 def dzop(capsys, monkeypatch, tmp_path, scene):
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str) -> Ran:
+    def run(*arguments: str) -> CommandResult:
         if arguments[0] == "cache":
             return run_dzop(capsys, monkeypatch, *arguments)
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", *SMALL)
@@ -55,7 +56,7 @@ def results(folder: Path) -> Path:
 
 
 def test_one_command_estimates_poses_and_a_second_one_computes_nothing(dzop, tmp_path):
-    first = dzop("overlays=true")
+    first = dzop("overlays=true", "gallery=12")
     assert first.status == 0
     made = first.counts()[0]
     assert made["templates"] == made["template features"] == (24, 0)
@@ -68,15 +69,15 @@ def test_one_command_estimates_poses_and_a_second_one_computes_nothing(dzop, tmp
     assert all(answer["status"] == "estimate" or (answer["stage"] and answer["reason"]) for answer in record["answers"])
     pictures = sorted((folder / "overlays").glob("*.jpg"))
     assert len(pictures) == 2
-    again = dzop("overlays=true").counts()[0]
+    again = dzop("overlays=true", "gallery=12").counts()[0]
     assert {computed for computed, _ in again.values()} == {0}
     assert {step: sum(counts) for step, counts in again.items()} == {step: sum(counts) for step, counts in made.items()}
 
 
 def test_a_cached_run_parses_no_mesh(dzop, cache, monkeypatch):
-    dzop(f"store.root={cache}", "gallery=0")
+    dzop(f"store.root={cache}")
     monkeypatch.setattr("pipeline.bop.dataset.read_model", None)
-    assert dzop(f"store.root={cache}", "gallery=0").status == 0
+    assert dzop(f"store.root={cache}").status == 0
 
 
 def test_a_mesh_of_the_wrong_diameter_is_refused_even_with_cached_templates(

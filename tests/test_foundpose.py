@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from array_bank import match, query_of
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from test_sweep_files import CONF
@@ -38,7 +38,7 @@ def dzop(capsys, monkeypatch, tmp_path):
     if not root.exists():
         write_tiny_bop(root)
 
-    def run(*arguments: str) -> Ran:
+    def run(*arguments: str) -> CommandResult:
         where = ("dataset=bop", "dataset.name=tiny", f"dataset.root={root}", f"store.root={tmp_path}/cache",
                  f"out={tmp_path}/results")  # fmt: skip
         return run_dzop(capsys, monkeypatch, *where, *WITH_HOG, *SMALL, *arguments)

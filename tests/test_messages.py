@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import Ran, heeds_ctrl_c, run_dzop
+from command import CommandResult, restore_ctrl_c, run_dzop
 from make_vit import write_vit
 from PIL import Image
 
@@ -32,7 +32,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dzop(capsys, monkeypatch, tmp_path, scene):
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str, flags: tuple[str, ...] = ()) -> Ran:
+    def run(*arguments: str, flags: tuple[str, ...] = ()) -> CommandResult:
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}")
         return run_dzop(capsys, monkeypatch, *flags, *dataset, *SMALL, *arguments)
 
@@ -97,7 +97,7 @@ def photo(capsys, monkeypatch, tmp_path, scene):
     monkeypatch.chdir(tmp_path)
     mesh, image = f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={scene}/test/000001/rgb/000000.png"
 
-    def run(*given: str) -> Ran:
+    def run(*given: str) -> CommandResult:
         return run_dzop(capsys, monkeypatch, "dataset=photo", mesh, image, "dataset.K=[150,150,80,60]", *SMALL, *given)
 
     return run
@@ -181,7 +181,7 @@ def test_ctrl_c_prints_one_line():
 def test_ctrl_c_during_imports_prints_no_traceback(tmp_path):
     command = [sys.executable, "-m", "pipeline", "step=detect"]
     process = subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=heeds_ctrl_c
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=restore_ctrl_c
     )
     maps = Path(f"/proc/{process.pid}/maps")
     until = time.monotonic() + 30

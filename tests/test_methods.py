@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 from make_weights import write_weights
 from tiny_bop import write_tiny_bop
 
@@ -33,7 +33,7 @@ def weights(tmp_path_factory) -> list[str]:
 def dzop(capsys, monkeypatch, tmp_path, weights):
     root = write_tiny_bop(tmp_path / "tiny")
 
-    def run(*arguments: str) -> Ran:
+    def run(*arguments: str) -> CommandResult:
         where = ("dataset=bop", "dataset.name=tiny", f"dataset.root={root}", f"store.root={tmp_path}/cache",
                  f"out={tmp_path}/results", *weights)  # fmt: skip
         return run_dzop(capsys, monkeypatch, *where, *SMALL, *arguments)

@@ -13,12 +13,15 @@ import pytest
 
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
-from tests.command import run_dzop
+from tests.command import run_dzop, run_dzop_for_module
 from tests.same_bytes import contents, poses
 
 ROOT = Path(__file__).parents[1]
 SMALL = ("method=dzop", "extract=pixels", "render.count=60", "render.size=96", "overlays=false", "gallery=0",
          "threads=1", "runtime.progress=false", "evaluate.vsd=false")  # fmt: skip
+
+
+SMALL_NODE = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80_000_000}
 
 
 @pytest.fixture(scope="module")
@@ -28,15 +31,15 @@ def scene(tmp_path_factory) -> Path:
     return root
 
 
-def command(scene: Path, folder: Path, *overrides: str) -> list[str]:
+def arguments(scene: Path, folder: Path, *overrides: str) -> list[str]:
     places = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"store.root={folder}/cache")
-    return [sys.executable, "-m", "pipeline", *places, f"out={folder}/results", *SMALL, *overrides]
+    return [*places, f"out={folder}/results", *SMALL, *overrides]
 
 
 @pytest.fixture(scope="module")
 def local(scene, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("local")
-    subprocess.run(command(scene, folder), cwd=ROOT, check=True, capture_output=True, timeout=300)
+    assert run_dzop_for_module(*arguments(scene, folder)).status == 0
     return folder
 
 
@@ -44,9 +47,13 @@ class TwoNodes:
     """A cluster of two nodes on this machine, with one core each."""
 
     def __init__(self, cluster_type: type) -> None:
-        small = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80_000_000}
-        self.cluster = cluster_type(initialize_head=True, head_node_args=small)
-        self.second = self.cluster.add_node(**small)
+        self.cluster = cluster_type(initialize_head=True, head_node_args=SMALL_NODE)
+        self.second = self.cluster.add_node(**SMALL_NODE)
+
+    def repair(self) -> None:
+        """Replace the second node where a test removed it."""
+        if self.second not in self.cluster.list_all_nodes():
+            self.second = self.cluster.add_node(**SMALL_NODE)
 
     def busy_worker(self) -> psutil.Process | None:
         """A worker of the second node that is computing an item."""
@@ -57,12 +64,18 @@ class TwoNodes:
         return None
 
 
-@pytest.fixture
-def nodes() -> Iterator[TwoNodes]:
+@pytest.fixture(scope="module")
+def started() -> Iterator[TwoNodes]:
     utils = pytest.importorskip("ray.cluster_utils", reason="needs Ray: pip install 'dzop[ray]'")
-    started = _start(utils.Cluster)
-    yield started
-    started.cluster.shutdown()
+    nodes = _start(utils.Cluster)
+    yield nodes
+    nodes.cluster.shutdown()
+
+
+@pytest.fixture
+def nodes(started: TwoNodes) -> TwoNodes:
+    started.repair()
+    return started
 
 
 def _start(cluster_type: type) -> TwoNodes:
@@ -79,9 +92,8 @@ def _start(cluster_type: type) -> TwoNodes:
 @pytest.mark.parametrize("dies", ["worker", "node"])
 def test_two_nodes_that_lose_a_worker_write_the_same_bytes_as_one_process(scene, local, tmp_path, nodes, dies):
     where = ("runtime=ray", f"runtime.address={nodes.cluster.address}", "runtime.actors=2")
-    run = subprocess.Popen(
-        command(scene, tmp_path, *where), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-m", "pipeline", *arguments(scene, tmp_path, *where)]
+    run = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     limit = time.monotonic() + 120
     while (worker := nodes.busy_worker()) is None and run.poll() is None and time.monotonic() < limit:
         time.sleep(0.01)
@@ -98,21 +110,13 @@ def test_two_nodes_that_lose_a_worker_write_the_same_bytes_as_one_process(scene,
     ours, theirs = (contents(Store(LocalStoreConfig(root=str(folder / "cache")))) for folder in (tmp_path, local))
     assert set(ours) == set(theirs)
     assert [path for path in ours if ours[path] != theirs[path]] == []
-    again = subprocess.run(command(scene, tmp_path), cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
-    assert again.stdout.count("computed") == 1
-    assert all(line.split()[-3] == "0" for line in _table(again.stdout)), again.stdout
-
-
-def _table(printed: str) -> list[str]:
-    """Lines of the step table, without its header and total."""
-    lines = printed.splitlines()
-    first = next(n for n, line in enumerate(lines) if line.startswith("step "))
-    return [line for line in lines[first + 1 :] if line and not line.startswith("total ")]
+    (again,) = run_dzop_for_module(*arguments(scene, tmp_path)).counts()
+    assert {computed for computed, _ in again.values()} == {0}
 
 
 def test_without_ray_the_message_says_how_to_install_it(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pipeline.ray_workers.ray", None)
-    ran = run_dzop(capsys, monkeypatch, *command(scene, tmp_path, "runtime=ray")[3:])
+    ran = run_dzop(capsys, monkeypatch, *arguments(scene, tmp_path, "runtime=ray"))
     assert (ran.status, ran.err) == (
         1,
         "error: runtime: found ray, which is not installed, needs pip install 'dzop[ray]'",
@@ -134,8 +138,8 @@ def test_impossible_settings_are_reported_before_a_cluster_is_started(
 ):
     pytest.importorskip("ray", reason="needs Ray: pip install 'dzop[ray]'")
     unwanted = "store.root" if "store=memory" in overrides else "nothing"
-    arguments = [word for word in command(scene, tmp_path, "runtime=ray")[3:] if unwanted not in word]
-    ran = run_dzop(capsys, monkeypatch, *arguments, *overrides)
+    given = [word for word in arguments(scene, tmp_path, "runtime=ray") if unwanted not in word]
+    ran = run_dzop(capsys, monkeypatch, *given, *overrides)
     assert ran.status == 1
     assert ran.err.startswith(f"error: {message}")
     assert len(ran.err.splitlines()) == 1

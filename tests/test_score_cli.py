@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 from scipy.spatial.transform import Rotation
 from tiny_bop import write_tiny_bop
 
@@ -47,7 +47,7 @@ def to_metres(row: ResultRow) -> ResultRow:
 
 
 def figures(dzop, csv: str, *arguments: str, dataset: str = "tiny") -> dict:
-    ran: Ran = dzop("score", csv, "--dataset", dataset, "--json", "figures.json", *arguments)
+    ran: CommandResult = dzop("score", csv, "--dataset", dataset, "--json", "figures.json", *arguments)
     assert ran.status == 0, ran.err
     return json.loads(Path("figures.json").read_text())
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 
 from pipeline.report.run_records import read_run_records
 from pipeline.synthetic.scenes import write_dataset
@@ -60,7 +60,7 @@ def start(tmp_path):
     return popen
 
 
-def check_failed_job(status: int | str | None, err: str, results: Path, page: Ran) -> None:
+def check_failed_job(status: int | str | None, err: str, results: Path, page: CommandResult) -> None:
     """One job of several had cluster.count=-1: the end of the output, the rows and the page name it."""
     assert status == 1
     last = err.strip().splitlines()[-1]

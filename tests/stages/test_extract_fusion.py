@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command import Ran, run_dzop
+from command import CommandResult, run_dzop
 from make_vit import write_vit
 
 from pipeline.errors import BadInput
@@ -167,7 +167,7 @@ def dzop(capsys, monkeypatch, tmp_path, scene):
         "runtime.device=cpu",
     )
 
-    def run(*arguments: str) -> Ran:
+    def run(*arguments: str) -> CommandResult:
         dataset = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", *small)
         options = next(i for i, a in enumerate(arguments) if "=" in a)  # argparse wants options before overrides
         return run_dzop(capsys, monkeypatch, *arguments[:options], *dataset, *arguments[options:])
