@@ -22,6 +22,8 @@ from pipeline.method import Stages
 MIN_PIXELS = 16  # smaller masks show no shape
 FULL_SHARE = 0.98  # of the image: such a mask is often inverted, or its colours are
 HALF_SHARE = 0.5  # of the image: a mask this large that also touches all four sides is often the background
+MAX_IDS = 10  # of objects in a warning
+NO_COLOURS = "it has no colours, so templates are grey and poses less accurate; use a textured or coloured mesh"
 OUTSIDE_SHARE = 0.1  # of a box outside the image: often two corners instead of corner, width and height
 
 
@@ -73,6 +75,22 @@ def _check_models(context: Context, *, cached: bool) -> list[str]:
     asked = [obj_id for obj_id in context.object_ids if obj_id in infos]
     read = [obj_id for obj_id in asked if not cached or infos[obj_id].is_diagonal]
     return [warning for obj_id in read if (warning := context.model(obj_id).warning)]
+
+
+def mesh_warnings(context: Context) -> list[str]:
+    """One line per kind of loss: what the objects' mesh files state that is not in the meshes, and missing colours."""
+    objects: dict[str, list[int]] = {}
+    for obj_id in context.object_ids:
+        mesh = context.model(obj_id).mesh
+        has_colours = mesh.colours is not None or mesh.texture is not None
+        for warning in (*mesh.warnings, *(() if has_colours else (NO_COLOURS,))):
+            objects.setdefault(warning, []).append(obj_id)
+    return [f"{_describe_objects(obj_ids)}: {warning}" for warning, obj_ids in objects.items()]
+
+
+def _describe_objects(obj_ids: Sequence[int]) -> str:
+    shown = ", ".join(map(str, obj_ids[:MAX_IDS])) + (", ..." if len(obj_ids) > MAX_IDS else "")
+    return f"mesh of object{'s' if len(obj_ids) > 1 else ''} {shown}"
 
 
 def _check_camera(context: Context, image: ImageId) -> str:

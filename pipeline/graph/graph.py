@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from pipeline.errors import BadInput
-from pipeline.graph.checks import check_layers, detection_warnings
+from pipeline.graph.checks import check_layers, detection_warnings, mesh_warnings
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.memory import Memory, estimate_peak, fit_to_budgets
@@ -84,9 +84,10 @@ class Graph:
         return self.detections.all
 
     def warnings(self) -> list[str]:
-        """Results of sanity checks on the detections, one line each."""
+        """Results of sanity checks on detections, cameras and meshes, one line each; cached runs read no mesh."""
         detections, cached = self.detect(), self.context.store.is_complete(self.poses.run_ref())
-        return detection_warnings(self.context, detections, cached=cached)
+        warnings = detection_warnings(self.context, detections, cached=cached)
+        return warnings if cached else warnings + mesh_warnings(self.context)
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""

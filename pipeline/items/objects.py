@@ -13,7 +13,8 @@ class Mesh:
     """A triangle mesh in millimetres with a texture, vertex colours, or neither (rendered grey).
 
     ``uv`` has its origin at the lower left of ``texture``, as in ply, obj and trimesh; rows of ``texture`` go from top
-    to bottom. ``digest``: sha256 of all files the mesh was read from (mesh, materials and textures).
+    to bottom. ``digest``: sha256 of all files the mesh was read from (mesh, materials and textures). ``warnings``: what
+    its file states that is not in the mesh, one line each.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -22,6 +23,7 @@ class Mesh:
     uv: Float[np.ndarray, "v 2"] | None = None
     texture: UInt8[np.ndarray, "H W 3"] | None = None
     digest: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,6 +147,69 @@ def test_nested_instances_are_not_expanded(tmp_path: Path):
     run_within(lambda: read_mesh(tmp_path / "copies.gltf"), seconds=5, megabytes=512)
 
 
+def test_chained_nodes_take_linear_time(tmp_path: Path):
+    """3,000 nodes, each inside the one before; trimesh's scene took 104 s."""
+    nodes = [{"children": [level + 1], "translation": [1, 0, 0]} for level in range(3000)] + [{"mesh": 0}]
+    points = "data:;base64," + base64.b64encode(TRIANGLE).decode()
+    stored = {"buffers": [{"uri": points, "byteLength": 36}], "bufferViews": [{"buffer": 0, "byteLength": 36}]}
+    (tmp_path / "chain.gltf").write_bytes(gltf(3, nodes=nodes, **stored))
+    assert run_within(lambda: read_mesh(tmp_path / "chain.gltf"), seconds=2, megabytes=512) == "read"
+
+
+def write_large_textures(folder: Path, count: int, *, different: bool) -> Path:
+    """An obj whose materials name textures of 40 megapixels in files of some kB."""
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in SQUARE)
+    lines, mtl = f"mtllib a.mtl\n{corners}vt 0 0\nvt 1 0\nvt 1 1\n", ""
+    for k in range(count):
+        name = f"t{k if different else 0}.png"
+        mtl += f"newmtl m{k}\nmap_Kd {name}\n"
+        lines += f"usemtl m{k}\nf 1/1 2/2 3/3\n"
+        if not (folder / name).exists():
+            Image.new("RGB", (8000, 5000), (200, 30, 30)).save(folder / name)
+    (folder / "a.mtl").write_text(mtl)
+    (folder / "a.obj").write_text(lines)
+    return folder / "a.obj"
+
+
+def test_large_texture_of_many_materials_is_held_once(tmp_path: Path):
+    """Eight materials with one texture of 167 kB took 13.9 GB."""
+    path = write_large_textures(tmp_path, 8, different=False)
+    assert run_within(lambda: read_mesh(path), seconds=5, megabytes=1024) == "read"
+
+
+def test_many_large_textures_are_refused_before_they_fill_the_memory(tmp_path: Path):
+    path = write_large_textures(tmp_path, 8, different=True)
+    message = message_within(lambda: read_mesh(path), seconds=10, megabytes=2048)
+    assert "textures of 280 megapixels in all, needs at most 268" in message
+
+
+def test_factors_of_one_large_texture_are_bounded_in_memory(tmp_path: Path):
+    """A glTF with sixteen materials that tint the same image differently needs sixteen images."""
+    image = Image.new("RGB", (6000, 6000), (200, 30, 30))
+    image.save(tmp_path / "t.png")
+    points = TRIANGLE + struct.pack("<6f", 0, 0, 1, 0, 1, 1)
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}]
+    accessors += [{"bufferView": 0, "byteOffset": 36, "componentType": 5126, "count": 3, "type": "VEC2"}]
+    attributes = {"POSITION": 0, "TEXCOORD_0": 1}
+    materials = [
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [k / 16, 1, 1, 1]}}
+        for k in range(16)
+    ]
+    document = gltf(
+        3,
+        meshes=[{"primitives": [{"attributes": attributes, "material": k} for k in range(16)]}],
+        accessors=accessors,
+        bufferViews=[{"buffer": 0, "byteLength": 60}],
+        buffers=[{"uri": "data:;base64," + base64.b64encode(points).decode(), "byteLength": 60}],
+        materials=materials,
+        textures=[{"source": 0}],
+        images=[{"uri": "t.png"}],
+    )
+    (tmp_path / "a.gltf").write_bytes(document)
+    message = message_within(lambda: read_mesh(tmp_path / "a.gltf"), seconds=10, megabytes=2048)
+    assert "megapixels in all" in message
+
+
 def test_texture_with_a_huge_claimed_size_is_rejected(tmp_path: Path):
     path = tmp_path / "c.obj"
     path.write_text(textured_obj(tmp_path))

@@ -1,7 +1,8 @@
 """Mesh files -> meshes in millimetres. The only package that uses trimesh's loaders.
 
 Coordinates are taken as millimetres, whatever unit a format prescribes. Materials and textures must lie in the mesh's
-folder or below it, symbolic links resolved; nothing outside is opened, downloaded or unpickled.
+folder or below it, symbolic links resolved; nothing outside is opened, downloaded or unpickled. What a file states is
+in the mesh, or the file is refused by name, or ``Mesh.warnings`` says what is missing.
 """
 
 from __future__ import annotations
@@ -13,52 +14,57 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from pipeline.errors import BadInput
-from pipeline.io.files import read_file
+from pipeline.errors import BadInput, DzopError
 from pipeline.io.meshes.checks import check_mesh
 from pipeline.io.meshes.companions import Companions
 from pipeline.io.meshes.diameter import diameter_mm
-from pipeline.io.meshes.ply import parse_ply, read_header, texture_name, write_ply
-from pipeline.io.meshes.scene import parse_scene
+from pipeline.io.meshes.gltf import parse_gltf
+from pipeline.io.meshes.obj import parse_obj
+from pipeline.io.meshes.off import parse_off
+from pipeline.io.meshes.ply import parse_ply, read_surface, write_ply
+from pipeline.io.meshes.stl import parse_stl
 from pipeline.items.objects import Mesh
 
 __all__ = ["SUFFIXES", "diameter_mm", "mesh_digest", "read_mesh", "write_ply"]
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
-READER_VERSIONS = dict.fromkeys(SUFFIXES, 1)
+READER_VERSIONS = dict.fromkeys(SUFFIXES, 2) | {".ply": 1, ".stl": 1}
 """Raise the number of a format when the same file gives another mesh. It is part of the mesh's digest from 2 on."""
-_READABLE = "a readable mesh file"
+_REVISED = 2  # version of a ply or stl that version 1 would have read otherwise
 
 
 def read_mesh(path: Path) -> Mesh:
     """The triangles of a .ply, .obj, .glb, .gltf, .stl or .off file; several geometries become one mesh.
 
     A ply's vertices keep their order; a vertex with several texture coordinates or colours gets copies after the last
-    vertex. Other formats keep the vertices that faces use, copies included. Raises BadInput for a file, material or
-    texture that is missing or broken, and for a mesh without extent.
+    vertex. obj files keep the vertices that faces use, copies included. Raises BadInput for a file, material or texture
+    that is missing or broken, for what is stated but cannot be read, and for a mesh without extent.
     """
     path = _check_path(path)
     companions = Companions(path)
-    mesh = _parse(path, companions)
+    with _one_line(path):
+        mesh, revised = _parse(path, companions.read_mesh(), companions)
     check_mesh(path, mesh)
-    return replace(mesh, digest=_digest(path, companions))
+    return replace(mesh, digest=_digest(path, companions, revised))
 
 
 def mesh_digest(path: Path) -> str:
-    """``read_mesh(path).digest``; of a ply only the header is read. Raises BadInput as ``read_mesh`` does."""
+    """``read_mesh(path).digest``; no texture of a ply is decoded. Raises BadInput as ``read_mesh`` does."""
     path = _check_path(path)
     if path.suffix.lower() != ".ply":
         return read_mesh(path).digest  # only parsing the mesh shows which files belong to it
     companions = Companions(path)
-    name = texture_name(read_header(path, read_file(path, _READABLE)))
-    if name is not None:
+    with _one_line(path):
+        surface = read_surface(path, companions.read_mesh())
+    for name in surface.header.textures:
         companions.read(name)
-    return _digest(path, companions)
+    return _digest(path, companions, surface.revised)
 
 
-def _digest(path: Path, companions: Companions) -> str:
+def _digest(path: Path, companions: Companions, revised: bool) -> str:
     """Digest of the files that were read, and of the reader's version."""
     version, files = READER_VERSIONS[path.suffix.lower()], companions.digest()
+    version = max(version, _REVISED) if revised else version
     return files if version == 1 else sha256(f"{files}, reader {version}".encode()).hexdigest()
 
 
@@ -71,30 +77,30 @@ def _check_path(path: Path) -> Path:
     return path
 
 
-def _parse(path: Path, companions: Companions) -> Mesh:
-    data = read_file(path, _READABLE)
-    parse = parse_ply if path.suffix.lower() == ".ply" else parse_scene
-    try:
-        with _silence_trimesh():
-            mesh = parse(path, data, companions)
-    except BadInput:
-        raise
-    except Exception as error:  # trimesh's parsers raise whatever numpy, struct or json does on broken bytes
-        if companions.failure is None:
-            reason = (str(error).splitlines() or [""])[0][:120]
-            found = f"unreadable content ({type(error).__name__}: {reason})"
-            raise BadInput(path, found=found, needed=f"a complete {path.suffix.lower()} file") from None
-    if companions.failure is not None:
-        raise companions.failure
-    return mesh
+def _parse(path: Path, data: bytes, companions: Companions) -> tuple[Mesh, bool]:
+    """The mesh, and whether version 1 of a ply's or stl's reader would have made another one of it."""
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return parse_ply(path, data, companions)
+    if suffix == ".stl":
+        return parse_stl(path, data)
+    if suffix == ".off":
+        return parse_off(path, data), False
+    return (parse_obj if suffix == ".obj" else parse_gltf)(path, data, companions), False
 
 
 @contextmanager
-def _silence_trimesh() -> Iterator[None]:
-    """Disable trimesh's log, which prints tracebacks for broken files; a BadInput reports them instead."""
+def _one_line(path: Path) -> Iterator[None]:
+    """Raise BadInput for whatever parsers raise on broken bytes, and disable trimesh's log, which prints tracebacks."""
     logger = logging.getLogger("trimesh")
     before, logger.disabled = logger.disabled, True
     try:
         yield
+    except DzopError:
+        raise
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0][:120]
+        found = f"unreadable content ({type(error).__name__}: {reason})"
+        raise BadInput(path, found=found, needed=f"a complete {path.suffix.lower()} file") from None
     finally:
         logger.disabled = before

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
 
 from pipeline.errors import BadInput
 from pipeline.functional.shading import DEFAULT_GREY
@@ -16,15 +17,20 @@ from pipeline.io.meshes.checks import check_uv
 from pipeline.io.meshes.corners import split_vertices
 from pipeline.items.objects import Mesh
 
-_MAX_TEXTURE_PX = 16384
+_MAX_SIDE_PX = 16384
+_MAX_ATLAS_PX = 1 << 27  # 400 MB; larger textures are halved until they fit
+_MIN_SIDE_PX = 16  # textures are not halved below this
 _GUTTER_PX = 8  # border around each texture in an atlas: enough for a minification by 8
 
 
 def join_meshes(path: Path, parts: Sequence[Mesh]) -> Mesh:
     """Several meshes as one. If one has a texture, all get one: in a common atlas, colours as single texels.
 
-    Raises BadInput, naming ``path``, for textures that do not fit an atlas.
+    Meshes that share a texture (the same array) share its place. Raises BadInput, naming ``path``, for textures that do
+    not fit an atlas.
     """
+    if len(parts) == 1:
+        return parts[0]
     if any(part.texture is not None for part in parts):
         parts = _share_atlas(path, [part if part.texture is not None else _bake_colours(part) for part in parts])
     elif any(part.colours is not None for part in parts):
@@ -41,6 +47,7 @@ def join_meshes(path: Path, parts: Sequence[Mesh]) -> Mesh:
         colours=concatenate("colours"),
         uv=concatenate("uv"),
         texture=parts[0].texture,
+        warnings=tuple(dict.fromkeys(warning for part in parts for warning in part.warnings)),
     )
 
 
@@ -53,46 +60,80 @@ def _vertex_colours(part: Mesh) -> UInt8[np.ndarray, "v 3"]:
 
 def _bake_colours(part: Mesh) -> Mesh:
     """The mesh with a texture in place of colours: a square palette; each face takes the texel of its mean colour."""
-    mean = np.rint(_vertex_colours(part)[part.faces].mean(axis=1)).astype(np.uint8)
-    palette, entry = np.unique(mean, axis=0, return_inverse=True)
-    size = int(np.ceil(len(palette) ** 0.5))
+    mean = np.rint(_vertex_colours(part)[part.faces].mean(axis=1)).astype(np.int64)
+    codes, entry = np.unique(mean @ [1 << 16, 1 << 8, 1], return_inverse=True)
+    size = int(np.ceil(len(codes) ** 0.5))
     texture = np.zeros((size * size, 3), dtype=np.uint8)
-    texture[: len(palette)] = palette
+    texture[: len(codes)] = (codes[:, None] >> [16, 8, 0]) & 255
     row, column = np.divmod(entry.reshape(-1), size)
     uv = np.stack([(column + 0.5) / size, 1 - (row + 0.5) / size], axis=-1)
     vertices, faces, uv = split_vertices(part.vertices, part.faces, np.repeat(uv[:, None], 3, axis=1))
-    return Mesh(vertices, faces, uv=uv, texture=texture.reshape(size, size, 3))
+    return replace(part, vertices=vertices, faces=faces, colours=None, uv=uv, texture=texture.reshape(size, size, 3))
 
 
 def _share_atlas(path: Path, parts: Sequence[Mesh]) -> list[Mesh]:
-    """The meshes with one common texture: theirs stacked from top to bottom, repeats written out."""
-    tiled = [_tile(path, part) for part in parts]
-    # each texture continues into its gutter as a repeat would, so that neighbours do not bleed into it
-    gutter = ((_GUTTER_PX, _GUTTER_PX), (_GUTTER_PX, _GUTTER_PX), (0, 0))
-    padded = [np.pad(texture, gutter, mode="wrap") for _, texture in tiled]
-    height, width = sum(texture.shape[0] for texture in padded), max(texture.shape[1] for texture in padded)
-    if max(height, width) > _MAX_TEXTURE_PX:
-        found = f"textures that make an atlas of {width} x {height}"
-        raise BadInput(path, found=found, needed=f"at most {_MAX_TEXTURE_PX} pixels a side; bake them into one")
+    """The meshes with one common texture: theirs side by side, repeats written out."""
+    textures = {id(part.texture): part.texture for part in parts if part.texture is not None}
+    lows, times = _measure_repeats(path, parts)
+    halved = 0
+    while True:
+        sizes = {key: np.array(texture.shape[:2]) * times[key][::-1] for key, texture in textures.items()}
+        corners, (height, width) = _pack({key: size + 2 * _GUTTER_PX for key, size in sizes.items()})
+        if max(height, width) <= _MAX_SIDE_PX and height * width <= _MAX_ATLAS_PX:
+            break
+        large = [key for key, texture in textures.items() if min(texture.shape[:2]) >= 2 * _MIN_SIDE_PX]
+        if not large:
+            found = f"textures that make an atlas of {width} x {height}, repeats written out"
+            raise BadInput(path, found=found, needed=f"at most {_MAX_SIDE_PX} pixels a side; bake them into one")
+        textures |= {key: np.asarray(Image.fromarray(textures[key]).reduce(2)) for key in large}
+        halved += 1
     atlas = np.zeros((height, width, 3), dtype=np.uint8)
-    placed, top = [], 0
-    for part, block, (uv, texture) in zip(parts, padded, tiled, strict=True):
-        h, w = texture.shape[:2]
-        atlas[top : top + len(block), : block.shape[1]] = block
-        x, y = _GUTTER_PX + uv[:, 0] * w, top + _GUTTER_PX + (1 - uv[:, 1]) * h
-        placed.append(replace(part, uv=np.stack([x / width, 1 - y / height], axis=-1), texture=atlas))
-        top += len(block)
+    for key, (top, left) in corners.items():
+        # each texture continues into its gutter as a repeat would, so that neighbours do not bleed into it
+        gutter = ((_GUTTER_PX, _GUTTER_PX), (_GUTTER_PX, _GUTTER_PX), (0, 0))
+        block = np.pad(np.tile(textures[key], (times[key][1], times[key][0], 1)), gutter, mode="wrap")
+        atlas[top : top + block.shape[0], left : left + block.shape[1]] = block
+    notes = (f"its textures are reduced to 1/{2**halved} of their size to fit one image",) if halved else ()
+    placed = []
+    for part, low in zip(parts, lows, strict=True):
+        key = id(part.texture)
+        uv = (part.uv - low) / times[key]
+        offset = np.array(corners[key]) + _GUTTER_PX
+        x, y = offset[1] + uv[:, 0] * sizes[key][1], offset[0] + (1 - uv[:, 1]) * sizes[key][0]
+        uv = np.stack([x / width, 1 - y / height], axis=-1)
+        placed.append(replace(part, uv=uv, texture=atlas, warnings=part.warnings + notes))
     return placed
 
 
-def _tile(path: Path, part: Mesh) -> tuple[Float[np.ndarray, "v 2"], UInt8[np.ndarray, "H W 3"]]:
-    """Texture coordinates within 0..1, and the texture repeated as often as the original coordinates repeat it."""
-    assert part.uv is not None
-    assert part.texture is not None
-    check_uv(path, part)
-    low = np.floor(part.uv.min(axis=0) + 1e-6)
-    times = np.maximum(np.ceil(part.uv.max(axis=0) - 1e-6) - low, 1)
-    if (times[::-1] * part.texture.shape[:2]).max() > _MAX_TEXTURE_PX:
-        found = f"a texture repeated {times[0]:.0f} x {times[1]:.0f} times"
-        raise BadInput(path, found=found, needed="one texture without repeats; bake it")
-    return (part.uv - low) / times, np.tile(part.texture, (int(times[1]), int(times[0]), 1))
+def _measure_repeats(
+    path: Path, parts: Sequence[Mesh]
+) -> tuple[list[Float[np.ndarray, " 2"]], dict[int, Int[np.ndarray, " 2"]]]:
+    """Lowest tile that each mesh uses, and how often each texture must repeat along x and y, by its id."""
+    lows: list[Float[np.ndarray, " 2"]] = []
+    times: dict[int, Int[np.ndarray, " 2"]] = {}
+    for part in parts:
+        assert part.uv is not None
+        check_uv(path, part)
+        low = np.floor(part.uv.min(axis=0) + 1e-6)
+        span = np.maximum(np.ceil(part.uv.max(axis=0) - 1e-6) - low, 1)
+        if span.max() > _MAX_SIDE_PX:
+            found = f"a texture repeated {span[0]:.0f} x {span[1]:.0f} times"
+            raise BadInput(path, found=found, needed="one texture without repeats; bake it")
+        lows.append(low)
+        key = id(part.texture)
+        times[key] = np.maximum(times.get(key, 1), span.astype(np.int64))
+    return lows, times
+
+
+def _pack(sizes: dict[int, Int[np.ndarray, " 2"]]) -> tuple[dict[int, tuple[int, int]], tuple[int, int]]:
+    """Upper left corners (top, left) of rectangles (h, w) in rows of falling height; and the size that holds them."""
+    area = sum(int(h) * int(w) for h, w in sizes.values())
+    width = min(max(int(area**0.5), *(int(w) for _, w in sizes.values())), 4 * _MAX_SIDE_PX)
+    corners, top, left, row_height, used = {}, 0, 0, 0, 0
+    for key, (h, w) in sorted(sizes.items(), key=lambda item: -int(item[1][0])):
+        if left and left + w > width:
+            top, left, row_height = top + row_height, 0, 0
+        corners[key] = (top, left)
+        left, row_height = left + int(w), max(row_height, int(h))
+        used = max(used, left)
+    return corners, (top + row_height, used)

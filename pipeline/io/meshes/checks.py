@@ -1,13 +1,16 @@
-"""Checks that a mesh can be rendered and measured."""
+"""Checks that a mesh can be rendered and measured, and that what its file states has arrived."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.errors import BadInput
 from pipeline.items.objects import Mesh
+
+_ROUNDING = 0.01  # of a mesh's largest side: stated bounds may be rounded, or taken before compression
 
 
 def check_mesh(path: Path, mesh: Mesh) -> None:
@@ -37,3 +40,24 @@ def check_indices(path: Path, mesh: Mesh) -> None:
     if low < 0 or high >= len(mesh.vertices):
         found = f"a face with vertex {low if low < 0 else high}"
         raise BadInput(path, found=found, needed=f"indices from 0 to {len(mesh.vertices) - 1}")
+
+
+def check_bounds(path: Path, vertices: Float[np.ndarray, "v 3"], stated: Float[np.ndarray, "2 3"]) -> None:
+    """Raise BadInput for vertices whose bounding box is another one than the file states (lowest, highest corner)."""
+    actual = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+    if not np.isfinite(vertices).all() or not np.isfinite(stated).all():
+        return  # reported by check_mesh
+    if np.abs(actual - stated).max() > _ROUNDING * max(np.ptp(stated, axis=0).max(), np.ptp(actual, axis=0).max()):
+        found = f"vertices from {_shown(actual[0])} to {_shown(actual[1])}"
+        needed = f"those from {_shown(stated[0])} to {_shown(stated[1])} that the file states; export it again"
+        raise BadInput(path, found=found, needed=needed)
+
+
+def check_count(path: Path, what: str, found: int, stated: int) -> None:
+    """Raise BadInput for another number of elements than there are vertices, or than the file states."""
+    if found != stated:
+        raise BadInput(path, found=f"{found} {what}", needed=f"{stated}")
+
+
+def _shown(point: Float[np.ndarray, " 3"]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Num, UInt8
 
 from pipeline.items.objects import Mesh
 
@@ -18,14 +21,28 @@ def split_vertices(
     """
     if faces.min() < 0 or faces.max() >= len(vertices):
         return vertices, faces, np.zeros((len(vertices), corners.shape[-1]))
-    rows = np.concatenate([faces.reshape(-1, 1), corners.reshape(len(faces) * 3, -1)], axis=1)
-    unique, inverse = np.unique(rows, axis=0, return_inverse=True)
-    vertex = unique[:, 0].astype(np.int64)
+    flat = corners.reshape(len(faces) * 3, -1)
+    key = rank_rows([faces.reshape(-1), *flat.T])
+    _, row, inverse = np.unique(key, return_index=True, return_inverse=True)
+    vertex = faces.reshape(-1)[row]
     is_copy = np.concatenate([[False], vertex[1:] == vertex[:-1]])
     index = np.where(is_copy, len(vertices) + np.cumsum(is_copy) - 1, vertex)
     values = np.zeros((len(vertices) + int(is_copy.sum()), corners.shape[-1]))
-    values[index] = unique[:, 1:]
+    values[index] = flat[row]
     return np.concatenate([vertices, vertices[vertex[is_copy]]]), index[inverse.reshape(faces.shape)], values
+
+
+def rank_rows(columns: list[Num[np.ndarray, " n"]]) -> Int[np.ndarray, " n"]:
+    """Integers in the order of the rows, compared column by column; equal rows get equal numbers.
+
+    Sorting one column at a time takes a fraction of the time and memory of sorting rows.
+    """
+    key = np.zeros(len(columns[0]), dtype=np.int64)
+    for column in columns:
+        distinct, rank = np.unique(column, return_inverse=True)
+        key = key * len(distinct) + rank
+        key = np.unique(key, return_inverse=True)[1]  # so that the next product stays small
+    return key
 
 
 def split_face_colours(mesh: Mesh, face_colours: UInt8[np.ndarray, "f 3"]) -> Mesh:
@@ -33,3 +50,15 @@ def split_face_colours(mesh: Mesh, face_colours: UInt8[np.ndarray, "f 3"]) -> Me
     corners = np.repeat(face_colours[:, None].astype(float), 3, axis=1)
     vertices, faces, colours = split_vertices(mesh.vertices, mesh.faces, corners)
     return Mesh(vertices, faces, colours=colours.astype(np.uint8))
+
+
+def select_faces(mesh: Mesh, chosen: Int[np.ndarray, " g"]) -> Mesh:
+    """Some of the mesh's faces, by their indices, and the vertices they use."""
+    used, index = np.unique(mesh.faces[chosen], return_inverse=True)
+
+    def at(values: Any) -> Any:
+        return None if values is None else values[used]
+
+    return replace(
+        mesh, vertices=mesh.vertices[used], faces=index.reshape(-1, 3), colours=at(mesh.colours), uv=at(mesh.uv)
+    )

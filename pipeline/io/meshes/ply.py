@@ -2,61 +2,91 @@
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int, Num
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.errors import BadInput
-from pipeline.io.meshes.companions import Companions, decode_texture
-from pipeline.io.meshes.corners import split_face_colours, split_vertices
+from pipeline.io.meshes.atlas import join_meshes
+from pipeline.io.meshes.checks import check_indices
+from pipeline.io.meshes.colours import to_uint8
+from pipeline.io.meshes.companions import Companions
+from pipeline.io.meshes.corners import select_faces, split_face_colours, split_vertices
+from pipeline.io.meshes.ply_table import Columns, Header, read_columns, read_header
+from pipeline.io.meshes.polygons import Ragged, triangulate
 from pipeline.items.objects import Mesh
 
+_UV_NAMES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("texture_s", "texture_t"))
+_UNSEEN = ("specular", "ambient", "emissi")  # reflections and light: not the colour of the surface
 
-def parse_ply(path: Path, data: bytes, companions: Companions) -> Mesh:
-    """The mesh in a ply's bytes, not checked yet. Raises BadInput.
 
-    Built from the elements that trimesh parses; trimesh's own conversion reorders vertices and drops colours.
+@dataclass(frozen=True)
+class Surface:
+    """A ply without its textures. ``corners``: index of each triangle's corners in the lists of ``polygons``.
+
+    ``revised``: read otherwise than by the first version of this reader, so that its digest must differ.
     """
-    from trimesh.exchange.ply import load_ply
 
+    header: Header
+    vertex: Columns
+    face: Columns
+    mesh: Mesh
+    polygons: Ragged
+    corners: Int[np.ndarray, "f 3"]
+    revised: bool
+
+    @property
+    def polygon(self) -> Int[np.ndarray, " f"]:
+        """Index of the polygon that each triangle is part of."""
+        return np.searchsorted(self.polygons.starts, self.corners[:, 0], side="right") - 1
+
+
+def parse_ply(path: Path, data: bytes, companions: Companions) -> tuple[Mesh, bool]:
+    """The mesh in a ply's bytes, not checked yet, and whether it is read otherwise than before. Raises BadInput."""
+    surface = read_surface(path, data)
+    textures = [companions.texture(name) for name in surface.header.textures]
+    if not textures:
+        return surface.mesh, surface.revised
+    if len(textures) == 1:
+        return _add_texture(path, surface, textures[0]), surface.revised
+    number = surface.face.get("texnumber", surface.face.get("texture_number"))
+    if not isinstance(number, np.ndarray):
+        found = f"{len(textures)} textures, and faces without 'texnumber'"
+        raise BadInput(path, found=found, needed="one texture, or each face's number of its own")
+    whole, number = _add_texture(path, surface, textures[0]), number[surface.polygon]
+    if number.max() >= len(textures):
+        raise BadInput(path, found=f"texnumber {number.max():g}", needed=f"numbers below {len(textures)}")
+    plain = replace(surface.mesh, warnings=())
+    parts = [
+        select_faces(replace(whole, texture=texture), np.flatnonzero(number == k)) for k, texture in enumerate(textures)
+    ]
+    parts.append(select_faces(plain, np.flatnonzero(number < 0)))
+    return join_meshes(path, [part for part in parts if len(part.faces)]), surface.revised
+
+
+def read_surface(path: Path, data: bytes) -> Surface:
+    """Triangles and colours in a ply's bytes; no other file is opened. Raises BadInput."""
     header = read_header(path, data)
-    parsed = load_ply(io.BytesIO(data), skip_materials=True, fix_texture=False)
-    elements = parsed["metadata"]["_ply_raw"]
+    lengths = {element.name: element.length for element in header.elements}
+    if lengths.get("tristrips") and not lengths.get("face"):
+        raise BadInput(path, found="triangle strips ('tristrips')", needed="faces; export it as triangles")
     for name in ("vertex", "face"):
-        if not elements.get(name, {}).get("length"):
+        if not lengths.get(name):
             raise BadInput(path, found=f"0 elements {name!r}", needed="a mesh with vertices and faces")
-    vertices, faces = np.asarray(parsed["vertices"], dtype=float), _triangulate(parsed["faces"])
-    if len(vertices) < elements["vertex"]["length"] or len(faces) < elements["face"]["length"]:
-        found = f"{len(vertices)} vertices and {len(faces)} faces"
-        declared = f"{elements['vertex']['length']} and {elements['face']['length']}"
-        raise BadInput(path, found=found, needed=f"the {declared} that its header declares")
-    mesh = Mesh(vertices, faces, colours=_columns(elements["vertex"], ("red", "green", "blue"), np.uint8))
-    if (texture := texture_name(header)) is not None:
-        return _add_texture(path, mesh, elements, texture, companions)
-    face_colours = _columns(elements["face"], ("red", "green", "blue"), np.uint8)
-    if mesh.colours is None and face_colours is not None and len(face_colours) == len(faces):
-        return split_face_colours(mesh, face_colours)
-    return mesh
-
-
-def read_header(path: Path, data: bytes) -> bytes:
-    """A ply's header, without ``end_header``. Raises BadInput."""
-    header, end, _ = data[: 1 << 16].partition(b"end_header")
-    if not header.startswith(b"ply") or not end:
-        raise BadInput(path, found="no ply header", needed="a complete .ply file")
-    return header
-
-
-def texture_name(header: bytes) -> str | None:
-    """File name in the header's ``comment TextureFile``, None without one."""
-    found = re.search(rb"comment\s+TextureFile\s+(.+)", header, flags=re.IGNORECASE)
-    return None if found is None else found[1].decode(errors="replace").strip()
+    tables = read_columns(path, data, header)
+    vertex, face = tables["vertex"], tables["face"]
+    vertices = _numbers(path, vertex, "xyz")
+    polygons = _polygons(path, face)
+    corners, cut = triangulate(vertices, polygons)
+    mesh = Mesh(vertices, polygons.values[corners].astype(np.int64))
+    check_indices(path, mesh)
+    surface = Surface(header, vertex, face, mesh, polygons, corners, cut or len(header.textures) > 1)
+    return surface if header.textures and len(header.textures) == 1 else _add_colours(path, surface)
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
@@ -75,40 +105,80 @@ def write_ply(path: Path, mesh: Mesh) -> None:
     path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
 
-def _add_texture(path: Path, mesh: Mesh, elements: dict[str, Any], name: str, companions: Companions) -> Mesh:
-    """The mesh with texture ``name``; its coordinates are stored by vertex (BOP) or by corner (MeshLab)."""
-    data = companions.get(name)
-    texture = decode_texture(path.parent / name, data)
-    corner_uv = _columns(elements["face"], ("texcoord",), float)
-    if corner_uv is not None:
-        if corner_uv.size != mesh.faces.size * 2:
-            found = f"{corner_uv.size} numbers in 'texcoord' for {len(mesh.faces)} triangles"
-            raise BadInput(path, found=found, needed="2 per corner of a triangle")
-        vertices, faces, uv = split_vertices(mesh.vertices, mesh.faces, corner_uv.reshape(-1, 3, 2))
+def _numbers(path: Path, columns: Columns, names: Iterable[str]) -> Float[np.ndarray, "n k"]:
+    missing = [name for name in names if not isinstance(columns.get(name), np.ndarray)]
+    if missing:
+        raise BadInput(path, found=f"vertices without {', '.join(missing)}", needed="x, y and z")
+    return np.stack([np.asarray(columns[name], dtype=float) for name in names], axis=-1)
+
+
+def _polygons(path: Path, face: Columns) -> Ragged:
+    """The vertices of each face."""
+    lists = {name: column for name, column in face.items() if isinstance(column, Ragged)}
+    named = [lists[name] for name in ("vertex_indices", "vertex_index") if name in lists]
+    if not named and len(lists) != 1:
+        raise BadInput(path, found=f"faces of {', '.join(face)}", needed="a list 'vertex_indices'")
+    return (named or list(lists.values()))[0]
+
+
+def _add_colours(path: Path, surface: Surface) -> Surface:
+    """With the vertices' colours, or else the faces'."""
+    colours, revised = _colours(path, surface.vertex)
+    if colours is not None:
+        mesh = replace(surface.mesh, colours=colours)
+        return replace(surface, mesh=mesh, revised=surface.revised or revised)
+    colours, revised = _colours(path, surface.face)
+    if colours is not None:
+        has_polygons = len(surface.corners) != len(surface.polygons.counts)
+        mesh = split_face_colours(surface.mesh, colours[surface.polygon])
+        return replace(surface, mesh=mesh, revised=surface.revised or revised or has_polygons)
+    stated = [
+        n
+        for n in (*surface.vertex, *surface.face)
+        if re.search("colou?r|rgb|red|green|blue|gr[ae]y|intensity", n.lower())
+    ]
+    if not stated:
+        return surface
+    warning = f"its properties {', '.join(stated)} are not read as colours; red, green and blue are"
+    return replace(surface, mesh=replace(surface.mesh, warnings=(warning,)))
+
+
+def _colours(path: Path, columns: Columns) -> tuple[UInt8[np.ndarray, "n 3"] | None, bool]:
+    """Colours, None without any; and whether they are read otherwise than before."""
+    names = _colour_names([name for name, column in columns.items() if isinstance(column, np.ndarray)])
+    if names is None:
+        return None, False
+    table = np.stack([np.asarray(columns[name]) for name in names], axis=-1)
+    limit = 1 if table.dtype.kind == "f" else 255
+    return to_uint8(path, table), names != ("red", "green", "blue") or bool(table.max(initial=0) > limit)
+
+
+def _colour_names(names: Sequence[str]) -> tuple[str, ...] | None:
+    """Names of the three properties of a colour: red, diffuse_red or r and the like; None without them."""
+    by_lower = {name.lower(): name for name in names}
+    found: dict[str, tuple[str, ...]] = {}
+    for name in by_lower:
+        prefix = name.removesuffix("red") if name.endswith("red") else ""
+        ends = ("r", "g", "b") if name == "r" else ("red", "green", "blue")
+        triple = tuple(by_lower.get(prefix + end, "") for end in ends)
+        if name == prefix + ends[0] and all(triple) and not prefix.startswith(_UNSEEN):
+            found[name] = triple
+    best = sorted(found, key=lambda red: (red != "red", "diffuse" not in red, len(red)))
+    return found[best[0]] if best else None
+
+
+def _add_texture(path: Path, surface: Surface, texture: UInt8[np.ndarray, "H W 3"]) -> Mesh:
+    """The mesh with a texture; its coordinates are stored by vertex (BOP) or by corner (MeshLab)."""
+    mesh, corner_uv = surface.mesh, surface.face.get("texcoord")
+    if isinstance(corner_uv, Ragged):
+        if len(corner_uv.values) != 2 * len(surface.polygons.values):
+            found = f"{len(corner_uv.values)} numbers in 'texcoord' for {len(surface.polygons.values)} corners"
+            raise BadInput(path, found=found, needed="2 per corner of a face")
+        by_corner = corner_uv.values.reshape(-1, 2).astype(float)[surface.corners]
+        vertices, faces, uv = split_vertices(mesh.vertices, mesh.faces, by_corner)
         return Mesh(vertices, faces, uv=uv, texture=texture)
-    for names in (("texture_u", "texture_v"), ("u", "v"), ("s", "t")):
-        vertex_uv = _columns(elements["vertex"], names, float)
-        if vertex_uv is not None:
-            return replace(mesh, colours=None, uv=vertex_uv, texture=texture)
-    raise BadInput(path, found=f"a texture {name!r} without coordinates", needed="texture_u, texture_v or texcoord")
-
-
-def _columns(element: dict[str, Any], names: Sequence[str], dtype: type) -> Num[np.ndarray, "n c"] | None:
-    """Properties of a ply element as columns, None if one is absent. Float colours (0..1) become 0..255."""
-    if any(name not in element["properties"] for name in names):
-        return None
-    data = element["data"]
-    # trimesh stores a list property as a structured array whose field f1 holds the values
-    columns = [data[name]["f1"] if getattr(data[name].dtype, "names", None) else data[name] for name in names]
-    table = np.concatenate([np.asarray(column).reshape(element["length"], -1) for column in columns], axis=1)
-    if dtype is np.uint8 and table.dtype.kind == "f":
-        table = np.rint(np.clip(table, 0, 1) * 255)
-    return table.astype(dtype)
-
-
-def _triangulate(faces: Any) -> Int[np.ndarray, "f 3"]:
-    from trimesh.geometry import triangulate_quads
-
-    if isinstance(faces, np.ndarray) and faces.ndim == 2 and faces.shape[1] == 3:
-        return faces.astype(np.int64)
-    return np.asarray(triangulate_quads(faces), dtype=np.int64).reshape(-1, 3)
+    for names in _UV_NAMES:
+        if all(isinstance(surface.vertex.get(name), np.ndarray) for name in names):
+            return replace(mesh, colours=None, uv=_numbers(path, surface.vertex, names), texture=texture)
+    found = f"a texture {surface.header.textures[0]!r} without coordinates"
+    raise BadInput(path, found=found, needed="texture_u, texture_v or texcoord")
