@@ -14,6 +14,7 @@ from make_sam import write_sam
 from PIL import Image as Picture
 from presets import QUICK
 
+from pipeline.backbones.batching import Passes
 from pipeline.backbones.extractor import Extractor
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.bop.detections import write_detections
@@ -75,7 +76,7 @@ class Hue(Extractor):
 
     kind: ClassVar[str] = "extract.hue"
     model: ClassVar[str] = "hue"
-    batch: ClassVar[int] = 7
+    passes: ClassVar[Passes] = Passes(torch.device("cpu"), batch=7, size=7)
 
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         if layer != CLASS_TOKEN_LAYER:

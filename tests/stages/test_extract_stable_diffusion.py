@@ -278,8 +278,10 @@ import numpy as np
 from benchmarks.measure import peak_bytes
 from pipeline.items.features import FeatureMaps
 from pipeline.items.views import Crops
+from pipeline.parallel import use_threads
 from pipeline.spec import Runtime
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
+use_threads(1)  # each further thread takes the memory of one more pass; runtime.max_memory bounds them
 rng = np.random.default_rng(0)
 n = 3  # a full pass has more: what the others would take is added below
 rgb = rng.integers(0, 256, (n, 128, 128, 3), dtype=np.uint8)
