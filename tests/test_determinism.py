@@ -71,7 +71,7 @@ def test_bytes_of_entries_depend_neither_on_batch_nor_on_threads(results, scene,
     assert differences(first, again) == []
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("method", METHODS)
 def test_bytes_on_photographs_depend_neither_on_batch_nor_on_threads_nor_on_processes(
