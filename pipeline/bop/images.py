@@ -118,14 +118,20 @@ def read_orientation(path: Path) -> int:
 def _open_header(path: Path) -> PIL.Image.Image:
     if path.exists() and not path.is_file():
         raise OSError("not a regular file")
-    image = PIL.Image.open(path, formats=IMAGE_FORMATS)
+    return _require_readable_size(PIL.Image.open(path, formats=IMAGE_FORMATS), path)
+
+
+def _require_readable_size(image: PIL.Image.Image, path: Path) -> PIL.Image.Image:
+    """An image whose pixels fit in memory: its header says how many there are."""
     check_megapixels(image.width, image.height, path)
     return image
 
 
 def _open(path: Path) -> PIL.Image.Image:
     try:
-        image = PIL.Image.open(io.BytesIO(read_file(path, "an image")), formats=IMAGE_FORMATS)
+        image = _require_readable_size(
+            PIL.Image.open(io.BytesIO(read_file(path, "an image")), formats=IMAGE_FORMATS), path
+        )
         image.load()  # PIL notices a truncated file only when it reads the pixels
     except _BROKEN as error:
         raise _unreadable_image(path, error) from None
