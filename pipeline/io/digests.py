@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -61,14 +61,14 @@ class FileState:
 class DigestCache:
     """Digests of large files on disk, one JSON file each: hashing four gigabytes of weights takes seconds.
 
-    A digest is found again by the file's resolved path, size, inode, mtime and ctime, so a rewritten file is a miss.
+    A file's digest is found again by its resolved path, size, inode, mtime and ctime, so a rewritten file is a miss;
+    what is derived from the content of files is found again by their digests.
     """
 
     folder: Path
 
-    def load(self, path: Path, state: FileState) -> str | None:
-        """The file's sha256 (hex), None if it is not cached or what is cached is damaged."""
-        identity = _identity(path, state)
+    def load(self, identity: str) -> str | None:
+        """The sha256 (hex) kept for an identity, None if there is none or what is there is damaged."""
         try:
             entry = json.loads(self._entry(identity).read_text())
             digest = str(entry["sha256"])
@@ -76,9 +76,8 @@ class DigestCache:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
 
-    def save(self, path: Path, state: FileState, digest: str) -> None:
+    def save(self, identity: str, digest: str, path: Path) -> None:
         """Cache a digest. A folder that cannot be written is ignored: the next run hashes the file again."""
-        identity = _identity(path, state)
         entry = self._entry(identity)
         partial = entry.with_suffix(f".{os.getpid()}.partial")
         record = {"path": str(path.resolve()), "sha256": digest, "check": _check(identity, digest)}
@@ -228,10 +227,28 @@ def files_digest(paths: Mapping[str, Path]) -> str:
     return sha256(lines.encode()).hexdigest()
 
 
+def derived_digest(kind: str, paths: Mapping[str, Path], compute: Callable[[], str]) -> str:
+    """``compute()``: a digest of what files hold, kept for the next run where they are large, by their own digests.
+
+    ``kind``: what is computed, and its version. Raises as ``file_digest``.
+    """
+    identity = f"{kind}\0{files_digest(paths)}"
+    is_large = any(path.stat().st_size >= _LARGE_BYTES for path in paths.values())
+    cache = _tracked.cache if _tracked is not None and is_large else None
+    found = cache.load(identity) if cache else None
+    if found is not None:
+        return found
+    with unchanged_files([*paths.values()]):
+        digest = compute()
+    if cache:
+        cache.save(identity, digest, next(iter(paths.values())))
+    return digest
+
+
 def _digest_of(path: Path, state: FileState, cache: DigestCache | None) -> str:
     """sha256 (hex) of a file; that of a large one is looked up in the cache, and kept there once it is settled."""
     usable = cache if cache and state.settled and state.size >= _LARGE_BYTES else None
-    found = usable.load(path, state) if usable else None
+    found = usable.load(_identity(path, state)) if usable else None
     if found is not None:
         return found
     hasher = sha256()
@@ -240,5 +257,5 @@ def _digest_of(path: Path, state: FileState, cache: DigestCache | None) -> str:
             hasher.update(block)
     digest = hasher.hexdigest()
     if usable and FileState.of(str(path)).is_same(state):
-        usable.save(path, state, digest)
+        usable.save(_identity(path, state), digest, path)
     return digest

@@ -1,6 +1,8 @@
 """A checkpoint in the original layout gives the features of the diffusers folder it was made from."""
 
+import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +160,77 @@ def test_its_key_depends_on_its_bytes_and_not_its_path(both: tuple[Path, Path], 
     moved = tmp_path / "renamed.safetensors"
     moved.write_bytes(file.read_bytes())
     assert extractor(moved).recipe() == extractor(file).recipe()
+
+
+def test_a_folder_and_a_file_of_the_same_weights_have_the_same_key(both: tuple[Path, Path]) -> None:
+    folder, file = (extractor(path) for path in both)
+    assert file.recipe() == folder.recipe()
+    assert file.model == folder.model
+
+
+def test_every_tensor_that_is_used_enters_the_key_and_no_other(both: tuple[Path, Path], tmp_path: Path) -> None:
+    tensors, changed = load_file(both[1]), tmp_path / "changed.safetensors"
+    is_sd2 = "model.diffusion_model.middle_block.1.proj_in.weight" in tensors and any(
+        name.startswith("cond_stage_model.model.") for name in tensors
+    )
+
+    def key(name: str) -> str:
+        save_file(tensors | {name: tensors[name] + 1}, changed)
+        return extractor(changed).recipe()["weights"]
+
+    whole = extractor(both[1]).recipe()["weights"]
+    text = (
+        "cond_stage_model.model.transformer.resblocks.0.attn.in_proj_bias"
+        if is_sd2
+        else "cond_stage_model.transformer.text_model.encoder.layers.0.self_attn.k_proj.bias"
+    )
+    used = (
+        text,
+        "model.diffusion_model.input_blocks.1.0.in_layers.2.weight",
+        "model.diffusion_model.out.2.bias",
+        "first_stage_model.quant_conv.bias",
+        "first_stage_model.encoder.mid.attn_1.q.weight",
+    )
+    assert len({whole, *map(key, used)}) == len(used) + 1
+    unused = ("model_ema.decay", "alphas_cumprod", "first_stage_model.decoder.conv_in.bias")
+    assert {key(name) for name in (*unused, *(("cond_stage_model.model.text_projection",) if is_sd2 else ()))} == {
+        whole
+    }
+
+
+def test_half_precision_of_a_file_is_that_of_a_folder(both: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, file = Path(shutil.copytree(both[0], tmp_path / "half")), tmp_path / "half.safetensors"
+    for path in folder.rglob("*.safetensors"):
+        save_file({name: tensor.half() for name, tensor in load_file(path).items()}, path)
+    save_file({name: tensor.half() for name, tensor in load_file(both[1]).items()}, file)
+    assert extractor(file).recipe() == extractor(folder).recipe()
+    assert extractor(file).recipe()["weights"] != extractor(both[1]).recipe()["weights"]
+    rounded = {name: tensor.half().float() for name, tensor in load_file(both[1]).items()}
+    save_file(rounded, tmp_path / "rounded.safetensors")
+    assert extractor(tmp_path / "rounded.safetensors").recipe() == extractor(file).recipe()
+    for dtype in ("float16", "float32"):
+        ours, theirs = (extractor(path, dtype=dtype).load(CPU)(some_crops(), [2, 11]) for path in (file, folder))
+        for k in ours:
+            assert ours[k].dtype == getattr(torch, dtype)
+            assert torch.equal(ours[k], theirs[k])
+
+
+def test_upcast_attention_changes_nothing(both: tuple[Path, Path], tmp_path: Path) -> None:
+    """SD 2.1's config sets it, which a single file cannot show. torch's fused attention sums in float32 anyway."""
+    folder = Path(shutil.copytree(both[0], tmp_path / "upcast"))
+    config = folder / "unet" / "config.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"upcast_attention": True}))
+    assert extractor(folder).recipe() == extractor(both[1]).recipe()
+    path = folder / "unet" / "diffusion_pytorch_model.safetensors"
+    # logits beyond float16's largest value, 65504
+    save_file({n: 300 * t if re.search(r"attn\d\.to_[qk]", n) else t for n, t in load_file(path).items()}, path)
+    plain = Path(shutil.copytree(folder, tmp_path / "plain"))
+    (plain / "unet" / "config.json").write_text((both[0] / "unet" / "config.json").read_text())
+    for dtype in ("float16", "float32"):
+        ours, theirs = (extractor(path, dtype=dtype).load(CPU)(some_crops(), [2, 11]) for path in (folder, plain))
+        for k in ours:
+            assert torch.isfinite(ours[k]).all()
+            assert torch.equal(ours[k], theirs[k])
 
 
 def test_a_prompt_needs_a_tokenizer_which_one_file_does_not_hold(both: tuple[Path, Path]) -> None:

@@ -11,10 +11,13 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from make_sd15 import write_folder
 from safetensors.torch import load_file, save_file
 
+import pipeline.io.digests
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod
+from pipeline.backbones.stable_diffusion.diffusers_folder import DiffusersFolder
 from pipeline.backbones.stable_diffusion.source import open_weights
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import is_local
+from pipeline.io.digests import DigestCache, track_files
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.stable_diffusion import StableDiffusion
 
@@ -56,12 +59,58 @@ def test_the_key_depends_on_the_bytes_and_not_the_path(original: Path, folder: P
     assert str(folder) not in json.dumps(there.recipe())
 
 
-@pytest.mark.parametrize("name", [UNET, VAE, "text_encoder/model.safetensors", "tokenizer/vocab.json"])
-def test_every_file_that_is_read_enters_the_key(original: Path, folder: Path, name: str) -> None:
+@pytest.mark.parametrize("name", [UNET, VAE, "text_encoder/model.safetensors"])
+def test_every_file_of_tensors_enters_the_key(original: Path, folder: Path, name: str) -> None:
     with (folder / name).open("r+b") as stream:
         stream.seek(-1, 2)
-        stream.write(b"\x01" if name.endswith("safetensors") else b" ")
+        stream.write(b"\x01")
     assert extractor(folder).recipe() != extractor(original).recipe()
+
+
+@pytest.mark.parametrize(
+    ("file", "fields"),
+    [
+        ("unet/config.json", {"attention_head_dim": [4, 8, 8, 8]}),
+        ("unet/config.json", {"norm_eps": 1e-6}),
+        ("vae/config.json", {"scaling_factor": 0.2}),
+        ("vae/config.json", {"shift_factor": 0.1}),
+        ("text_encoder/config.json", {"hidden_act": "gelu"}),
+        ("text_encoder/config.json", {"layer_norm_eps": 1e-6}),
+        ("tokenizer/tokenizer_config.json", {"pad_token": "!"}),
+    ],
+)
+def test_every_field_that_changes_features_enters_the_key(original: Path, folder: Path, file: str, fields) -> None:
+    edit(folder / file, **fields)
+    assert extractor(folder).recipe() != extractor(original).recipe()
+
+
+def test_fields_without_effect_do_not_enter_the_key(original: Path, folder: Path) -> None:
+    edit(folder / "unet" / "config.json", sample_size=96, _diffusers_version="0.6.0", attention_head_dim=[8, 8, 8, 8])
+    edit(folder / "vae" / "config.json", sample_size=768, force_upcast=False)
+    edit(folder / "text_encoder" / "config.json", architectures=["CLIPTextModel"], torch_dtype="float16")
+    edit(folder / "scheduler" / "scheduler_config.json", prediction_type="v_prediction", rescale_betas_zero_snr=False)
+    (folder / "tokenizer" / "vocab.json").write_bytes((folder / "tokenizer" / "vocab.json").read_bytes() + b" ")
+    assert extractor(folder).recipe() == extractor(original).recipe()
+
+
+def test_a_folder_without_a_tokenizer_has_the_key_of_one_with_it(original: Path, folder: Path) -> None:
+    shutil.rmtree(folder / "tokenizer")
+    assert extractor(folder).recipe() == extractor(original).recipe()
+
+
+def test_the_digest_of_large_weights_is_kept_until_they_change(folder: Path, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(pipeline.io.digests, "_LARGE_BYTES", 1)
+    monkeypatch.setattr(pipeline.io.digests, "_SETTLED_NS", 0)
+    read: list[str] = []
+    tensors = DiffusersFolder.tensors
+    monkeypatch.setattr(DiffusersFolder, "tensors", lambda self, part: read.append(part) or tensors(self, part))
+    keys = []
+    for edits in ({}, {}, {"sample_size": 96}):
+        edit(folder / "unet" / "config.json", **edits)
+        with track_files(DigestCache(tmp_path / "kept")):
+            keys.append(extractor(folder).weights_digest)
+    assert len(set(keys)) == 1
+    assert read == 2 * ["unet", "vae", "text_encoder"]  # the second run reads none, the third has another file
 
 
 def test_the_noise_schedule_enters_the_key_and_is_used(original: Path, folder: Path) -> None:

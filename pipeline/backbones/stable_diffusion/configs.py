@@ -64,9 +64,14 @@ def alphas_cumprod(scheduler: Mapping[str, Any], where: Path | None = None) -> F
 
     if "Flow" in str(scheduler.get("_class_name", "")):
         raise BadInput(where, found=f"_class_name {scheduler['_class_name']!r}", needed="a scheduler with betas")
-    schedule = _SCHEDULE | {name: scheduler[name] for name in _SCHEDULE_FIELDS if scheduler.get(name) is not None}
     try:
-        ddpm: Any = DDPMScheduler(**schedule)
+        ddpm: Any = DDPMScheduler(**schedule_fields(scheduler))
         return ddpm.alphas_cumprod.double().numpy()
     except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
         raise BadInput(where, found=first_line(error), needed="a schedule of betas that diffusers knows") from None
+
+
+def schedule_fields(scheduler: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a scheduler's config that the noise depends on; missing ones are Stable Diffusion's."""
+    given = {name: scheduler.get(name) for name in _SCHEDULE_FIELDS}
+    return _SCHEDULE | {name: value for name, value in given.items() if value is not None and value is not False}

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor, nn
+from jaxtyping import Int
+from torch import Tensor
 
 from pipeline.backbones.stable_diffusion.configs import (
     alphas_cumprod,
@@ -19,14 +19,9 @@ from pipeline.backbones.stable_diffusion.configs import (
     check_unet,
 )
 from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
-from pipeline.backbones.stable_diffusion.loading import (
-    allocate_model,
-    build_text_encoder,
-    drop_decoder,
-    encode_text,
-    load_weights,
-    tokenize_empty_prompt,
-)
+from pipeline.backbones.stable_diffusion.identity import Part
+from pipeline.backbones.stable_diffusion.loading import Stored, read_tensors, tokenize_empty_prompt
+from pipeline.backbones.stable_diffusion.weights import Weights
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import fetch_snapshot, first_line, list_pickles, list_shards, read_json
 from pipeline.io.digests import file_exists
@@ -41,7 +36,7 @@ _STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "
 
 
 @dataclass(frozen=True)
-class DiffusersFolder:
+class DiffusersFolder(Weights):
     """A folder written by diffusers' save_pretrained: unet, vae, text_encoder; tokenizer and scheduler if present."""
 
     root: Path
@@ -51,7 +46,7 @@ class DiffusersFolder:
         """Configs and weights that are read, and all files of the tokenizer: transformers decides which it reads."""
         paths = [self._config_path(part) for part in _STEMS]
         paths += [path for part in _STEMS for path in self._list_tensors(part)]
-        paths += [self.root / "scheduler" / "scheduler_config.json"]
+        paths += [self._schedule]
         paths += [self.root / "tokenizer" / name for name in _TOKENIZER_FILES]
         paths += [path for path in (self.root / "tokenizer").glob("[!.]*") if path.is_file()]
         return {path.relative_to(self.root).as_posix(): path for path in paths if file_exists(path)}
@@ -62,66 +57,49 @@ class DiffusersFolder:
             raise BadInput(
                 self.root / "text_encoder_2", found="a second text encoder", needed="Stable Diffusion 1.x or 2.x"
             )
-        unet, vae = self._read_config("unet"), self._read_config("vae")
+        unet, vae = self.read_config("unet"), self.read_config("vae")
         check_unet(unet, self._config_path("unet"))
         check_class(vae, "AutoencoderKL", self._config_path("vae"))
         check_fields(vae, ("block_out_channels",), self._config_path("vae"))
         check_latents(unet, vae, self._config_path("unet"))
-        scheduler = self.root / "scheduler" / "scheduler_config.json"
-        return DiffusionConfigs(
-            unet, vae, alphas_cumprod(read_json(scheduler) if file_exists(scheduler) else {}, scheduler)
-        )
+        return DiffusionConfigs(unet, vae, alphas_cumprod(self.read_config("scheduler"), self._schedule))
 
-    def load_unet(self, dtype: torch.dtype) -> nn.Module:
-        """See Weights."""
-        from diffusers import UNet2DConditionModel
-
-        return self._fill(self._allocate(UNet2DConditionModel, "unet", dtype), "unet")
-
-    def load_vae(self, dtype: torch.dtype) -> nn.Module:
-        """See Weights."""
-        from diffusers import AutoencoderKL
-
-        return self._fill(drop_decoder(self._allocate(AutoencoderKL, "vae", dtype)), "vae")
-
-    def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
-        """See Weights."""
-        config, width = self._read_config("text_encoder"), self._read_config("unet")["cross_attention_dim"]
-        if config.get("hidden_size") != width:
-            found = f"hidden_size {config.get('hidden_size')}"
-            raise BadInput(self._config_path("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
-        ids = self._tokenize(text, config)
-        outer, inner = build_text_encoder(config, self._config_path("text_encoder"))
-        self._fill(inner, "text_encoder")
-        return encode_text(outer, ids)
-
-    def _tokenize(self, text: str, config: Mapping[str, Any]) -> Int[Tensor, "1 l"]:
-        folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
-        if not any(file_exists(folder / name) for name in ("vocab.json", "tokenizer.json")):
-            return tokenize_empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
-        from transformers import CLIPTokenizer
-
-        try:
-            tokenizer = CLIPTokenizer.from_pretrained(str(folder), local_files_only=True)
-            ids = tokenizer(text, padding="max_length", max_length=length, truncation=False)["input_ids"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BadInput(folder, found=first_line(error), needed="the files of a CLIP tokenizer") from None
-        if len(ids) > length:
-            raise BadInput(
-                "extract.prompt", found=f"{len(ids)} tokens", needed=f"at most {length}, begin and end included"
-            )
-        return torch.tensor([ids])
-
-    def _config_path(self, part: str) -> Path:
-        return self.root / part / "config.json"
-
-    def _read_config(self, part: str) -> dict[str, Any]:
+    def read_config(self, part: Part | str) -> dict[str, Any]:
+        """See Weights; {} for a scheduler that is not there."""
+        if part == "scheduler":
+            return read_json(self._schedule) if file_exists(self._schedule) else {}
         path = self._config_path(part)
         if not path.exists():
             seen = sorted(p.parent.name for p in self.root.glob("*/config.json"))
             needed = "a Stable Diffusion 1.x or 2.x folder with unet, vae and text_encoder"
             raise BadInput(path, found=f"no such file (configs of: {', '.join(seen) or 'nothing'})", needed=needed)
         return read_json(path)
+
+    def config_place(self, part: Part) -> Path:
+        """See Weights."""
+        return self._config_path(part)
+
+    def read_tensors(self, part: Part, wanted: Mapping[str, Tensor]) -> Iterator[Stored]:
+        """See Weights."""
+        return read_tensors([path for path in self._list_tensors(part) if path.suffix == ".safetensors"], wanted)
+
+    def tokenize(self, text: str) -> Int[Tensor, "1 l"]:
+        """See Weights."""
+        config, width = self.read_config("text_encoder"), self.read_config("unet")["cross_attention_dim"]
+        if config.get("hidden_size") != width:
+            found = f"hidden_size {config.get('hidden_size')}"
+            raise BadInput(self._config_path("text_encoder"), found=found, needed=f"{width}, as the U-Net attends to")
+        folder, length = self.root / "tokenizer", int(config.get("max_position_embeddings", 77))
+        if not any(file_exists(folder / name) for name in ("vocab.json", "tokenizer.json")):
+            return tokenize_empty_prompt(text, folder, open_clip=config.get("hidden_act") == "gelu", length=length)
+        return _run_tokenizer(text, folder, length)
+
+    @property
+    def _schedule(self) -> Path:
+        return self.root / "scheduler" / "scheduler_config.json"
+
+    def _config_path(self, part: str) -> Path:
+        return self.root / part / "config.json"
 
     def _list_tensors(self, part: str) -> list[Path]:
         """Weight files of a part: one, or an index and its shards; full precision is preferred to half."""
@@ -137,12 +115,18 @@ class DiffusersFolder:
         needed = "safetensors: convert it (save_pretrained, safe_serialization=True)" if pickled else "the weights"
         raise BadInput(folder / f"{stem}.safetensors", found=found, needed=needed)
 
-    def _allocate(self, cls: Any, part: str, dtype: torch.dtype) -> nn.Module:
-        return allocate_model(cls, self._read_config(part), dtype, self._config_path(part))
 
-    def _fill(self, model: nn.Module, part: str) -> nn.Module:
-        load_weights(model, [path for path in self._list_tensors(part) if path.suffix == ".safetensors"])
-        return model
+def _run_tokenizer(text: str, folder: Path, length: int) -> Int[Tensor, "1 l"]:
+    from transformers import CLIPTokenizer
+
+    try:
+        tokenizer = CLIPTokenizer.from_pretrained(str(folder), local_files_only=True)
+        ids = tokenizer(text, padding="max_length", max_length=length, truncation=False)["input_ids"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BadInput(folder, found=first_line(error), needed="the files of a CLIP tokenizer") from None
+    if len(ids) > length:
+        raise BadInput("extract.prompt", found=f"{len(ids)} tokens", needed=f"at most {length}, begin and end included")
+    return torch.tensor([ids])
 
 
 def download(hub_id: str, revision: str | None) -> Path:

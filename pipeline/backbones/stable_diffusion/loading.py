@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from pipeline.backbones.pretrained import silence_libraries
+from pipeline.backbones.stable_diffusion.identity import Part
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import check_missing, first_line, tensor_shapes
 
-NameMap = Callable[[str], str | None]
+Stored = tuple[str, Tensor, str]
+"""Name, value and place (file and name in it) of a stored tensor."""
 
 _ATTENTION_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 _PORTION = 1 << 26  # values read before a file is unmapped and mapped again
@@ -37,12 +39,17 @@ def tokenize_empty_prompt(text: str, where: Path, *, open_clip: bool, length: in
 
 def allocate_model(cls: Any, config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
     """A model of a diffusers class with uninitialised weights. Raises BadInput for a config it does not take."""
+    return _build_empty(cls, config, where, dtype).to_empty(device="cpu")
+
+
+def _build_empty(cls: Any, config: Mapping[str, Any], where: object, dtype: torch.dtype = torch.float32) -> nn.Module:
+    """A model of a diffusers class on the meta device: without memory."""
     try:
         with torch.device("meta"), silence_libraries():
-            model = cls.from_config(dict(config)).to(dtype)
+            model: nn.Module = cls.from_config(dict(config)).to(dtype)
     except (ValueError, TypeError, KeyError, IndexError, RuntimeError, NotImplementedError) as error:
         raise BadInput(where, found=first_line(error), needed=f"a config of {cls.__name__}") from None
-    return model.to_empty(device="cpu")
+    return model
 
 
 def allocate_unet(config: Mapping[str, Any], dtype: torch.dtype, where: object = "config") -> nn.Module:
@@ -85,36 +92,47 @@ def to_current_name(name: str) -> str:
     return old[1] + _ATTENTION_NAMES[old[2]] + old[3] if old else name
 
 
-def load_weights(
-    model: nn.Module, paths: Sequence[Path], name_of: Callable[[str], str | None] = to_current_name
-) -> None:
-    """Copy weights from safetensors files into a model. Raises BadInput for missing weights and other shapes.
+def lay_out(part: Part, config: Mapping[str, Any], where: object) -> dict[str, nn.Parameter]:
+    """The parameters of a part that are used, by name, without memory: their shapes. Raises BadInput."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+
+    if part == "text_encoder":
+        with torch.device("meta"):
+            return dict(build_text_encoder(config, where)[1].named_parameters())
+    if part == "unet":
+        return dict(_build_empty(UNet2DConditionModel, config, where).named_parameters())
+    return dict(drop_decoder(_build_empty(AutoencoderKL, config, where)).named_parameters())
+
+
+def read_tensors(
+    paths: Sequence[Path],
+    wanted: Mapping[str, Tensor],
+    name_of: Callable[[str], str | None] = to_current_name,
+) -> Iterator[Stored]:
+    """Tensors of safetensors files whose names are wanted. Raises BadInput if one is missing.
 
     ``name_of``: maps a stored tensor's name to the model's, None to skip it. A file is mapped again every few hundred
     megabytes, because the pages already read would count as a second copy of the weights.
     """
     from safetensors import safe_open
 
-    missing = dict(model.named_parameters())
+    missing = dict(wanted)
     for path in paths:
         stored = {name: s for s in tensor_shapes(path) if (name := name_of(s)) is not None and name in missing}
         for names in _portions(stored, missing):
-            with safe_open(str(path), framework="pt") as tensors, torch.no_grad():
-                _copy_portion(tensors, [(stored[name], missing.pop(name)) for name in names], path)
+            with safe_open(str(path), framework="pt") as tensors:
+                for name in names:
+                    missing.pop(name)
+                    yield name, tensors.get_tensor(stored[name]), f"{path}, tensor {stored[name]}"
     check_missing(sorted(missing), paths[0])
 
 
-def _copy_portion(tensors: Any, pairs: Iterable[tuple[str, nn.Parameter]], path: Path) -> None:
-    for stored_name, parameter in pairs:
-        copy_weight(tensors.get_tensor(stored_name), parameter, f"{path}, tensor {stored_name}")
-
-
-def _portions(names: Iterable[str], parameters: Mapping[str, nn.Parameter]) -> list[list[str]]:
+def _portions(names: Iterable[str], tensors: Mapping[str, Tensor]) -> list[list[str]]:
     portions: list[list[str]] = [[]]
     size = 0
     for name in names:
         portions[-1].append(name)
-        size += parameters[name].numel()
+        size += tensors[name].numel()
         if size > _PORTION:
             portions.append([])
             size = 0

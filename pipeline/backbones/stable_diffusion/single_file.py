@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from jaxtyping import Int
+from torch import Tensor
 
 from pipeline.backbones.stable_diffusion.configs import alphas_cumprod, check_latents
 from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
-from pipeline.backbones.stable_diffusion.loading import (
-    allocate_model,
-    build_text_encoder,
-    copy_weight,
-    drop_decoder,
-    encode_text,
-    load_weights,
-    tokenize_empty_prompt,
-)
+from pipeline.backbones.stable_diffusion.identity import Part
+from pipeline.backbones.stable_diffusion.loading import Stored, read_tensors, tokenize_empty_prompt
+from pipeline.backbones.stable_diffusion.weights import Weights
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import check_missing, tensor_shapes
 
@@ -44,8 +38,8 @@ _OPEN_CLIP_NAMES = {
 
 
 @dataclass(frozen=True)
-class SingleFile:
-    """U-Net, VAE and text encoder in one file; see source.Weights."""
+class SingleFile(Weights):
+    """U-Net, VAE and text encoder in one file; see Weights."""
 
     path: Path
 
@@ -76,56 +70,75 @@ class SingleFile:
         check_latents(unet, vae, self.path)
         return DiffusionConfigs(unet, vae, alphas_cumprod({}))
 
-    def load_unet(self, dtype: torch.dtype) -> nn.Module:
+    def read_config(self, part: Part | str) -> dict[str, Any]:
+        """See Weights: inferred from the shapes; {} for the scheduler, which is Stable Diffusion's."""
+        if part in ("unet", "vae"):
+            configs = self.read_configs()
+            return dict(configs.unet if part == "unet" else configs.vae)
+        return self._read_text_config() if part == "text_encoder" else {}
+
+    def config_place(self, part: Part) -> Path:
         """See Weights."""
-        from diffusers import UNet2DConditionModel
-        from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
+        return self.path
 
-        config = self.read_configs().unet
-        model = allocate_model(UNet2DConditionModel, config, dtype, self.path)
-        # names in place of tensors: the converter of a U-Net only renames
-        renamed = convert_ldm_unet_checkpoint({n: n for n in self.shapes if n.startswith(_UNET)}, dict(config))
-        load_weights(model, [self.path], {stored: name for name, stored in renamed.items()}.get)
-        return model
-
-    def load_vae(self, dtype: torch.dtype) -> nn.Module:
+    def read_tensors(self, part: Part, wanted: Mapping[str, Tensor]) -> Iterator[Stored]:
         """See Weights."""
-        from diffusers import AutoencoderKL
-        from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
+        from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint, convert_ldm_vae_checkpoint
 
-        config = self.read_configs().vae
-        model = drop_decoder(allocate_model(AutoencoderKL, config, dtype, self.path))
-        return self._fill(model, convert_ldm_vae_checkpoint(self._read_tensors(_VAE), dict(config)))
+        if part == "unet":
+            # names in place of tensors: the converter of a U-Net only renames
+            stored = {n: n for n in self.shapes if n.startswith(_UNET)}
+            renamed = convert_ldm_unet_checkpoint(stored, self.read_config(part))
+            yield from read_tensors([self.path], wanted, {stored: name for name, stored in renamed.items()}.get)
+            return
+        state = (
+            convert_ldm_vae_checkpoint(self._read(_VAE), self.read_config(part))
+            if part == "vae"
+            else self._convert_text(self._read(self._text_prefix))
+        )
+        check_missing(sorted(wanted.keys() - state.keys()), self.path)
+        for name in wanted:
+            yield name, state[name], f"{self.path}, tensor {name}"
 
-    def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
+    def tokenize(self, text: str) -> Int[Tensor, "1 l"]:
         """See Weights. Such a file has no tokenizer, so only the empty text is possible."""
-        is_open = any(name.startswith(_OPEN_CLIP) for name in self.shapes)
-        prefix = _OPEN_CLIP if is_open else _CLIP
-        state = {name.removeprefix(prefix): tensor for name, tensor in self._read_tensors(prefix).items()}
+        length = self._read_text_config()["max_position_embeddings"]
+        return tokenize_empty_prompt(text, self.path, open_clip=self._is_open_clip, length=length)
+
+    @property
+    def _is_open_clip(self) -> bool:
+        return any(name.startswith(_OPEN_CLIP) for name in self.shapes)
+
+    @property
+    def _text_prefix(self) -> str:
+        return _OPEN_CLIP if self._is_open_clip else _CLIP
+
+    def _read_text_config(self) -> dict[str, Any]:
+        shapes = select_prefix(self.shapes, self._text_prefix)
+        state = self._convert_text({name: torch.empty(shape, device="meta") for name, shape in shapes.items()})
         try:
-            state = convert_open_clip(state) if is_open else _strip_wrapper(state)
-            config = text_config({name: tuple(t.shape) for name, t in state.items()}, open_clip=is_open)
+            return text_config({name: tuple(t.shape) for name, t in state.items()}, open_clip=self._is_open_clip)
         except KeyError as error:
-            needed = "the text encoder of CLIP or OpenCLIP"
-            raise BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed) from None
-        ids = tokenize_empty_prompt(text, self.path, open_clip=is_open, length=config["max_position_embeddings"])
-        outer, inner = build_text_encoder(config, self.path)
-        self._fill(inner, state)
-        return encode_text(outer, ids)
+            raise self._lacks(error) from None
 
-    def _fill(self, model: nn.Module, state: Mapping[str, Tensor]) -> nn.Module:
-        missing = dict(model.named_parameters())
-        with torch.no_grad():
-            for name in missing.keys() & state.keys():
-                copy_weight(state[name], missing.pop(name), f"{self.path}, tensor {name}")
-        check_missing(sorted(missing), self.path)
-        return model
+    def _convert_text(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The text encoder's tensors with transformers' names."""
+        try:
+            return convert_open_clip(state) if self._is_open_clip else _strip_wrapper(state)
+        except KeyError as error:
+            raise self._lacks(error) from None
 
-    def _read_tensors(self, prefix: str) -> dict[str, Tensor]:
+    def _lacks(self, error: KeyError) -> BadInput:
+        needed = "the text encoder of CLIP or OpenCLIP"
+        return BadInput(self.path, found=f"no tensor {error.args[0]}", needed=needed)
+
+    def _read(self, prefix: str) -> dict[str, Tensor]:
+        """Tensors whose names start with a prefix, by the rest of their name; of the VAE by the whole name."""
         from safetensors import safe_open
 
+        kept = "" if prefix == _VAE else prefix  # diffusers' converter looks for the VAE's prefix itself
         with safe_open(str(self.path), framework="pt") as tensors:
-            return {name: tensors.get_tensor(name) for name in self.shapes if name.startswith(prefix)}
+            return {n.removeprefix(kept): tensors.get_tensor(n) for n in self.shapes if n.startswith(prefix)}
 
 
 def select_prefix(shapes: Shapes, prefix: str) -> Shapes:

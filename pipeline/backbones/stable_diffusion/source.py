@@ -3,42 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
-
-import torch
-from jaxtyping import Float
-from torch import Tensor, nn
 
 from pipeline.backbones.stable_diffusion.diffusers_folder import FIELD, NAME, DiffusersFolder, download
-from pipeline.backbones.stable_diffusion.features import DiffusionConfigs
 from pipeline.backbones.stable_diffusion.single_file import SingleFile
+from pipeline.backbones.stable_diffusion.weights import Weights
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import is_local, resolve_hub_cache, sweep_hint
-
-
-class Weights(Protocol):
-    """A Stable Diffusion model on disk. The models that it loads are on the CPU."""
-
-    @property
-    def files(self) -> dict[str, Path]:
-        """The files whose bytes determine the features, by name."""
-        ...
-
-    def read_configs(self) -> DiffusionConfigs:
-        """Configs, checked to be Stable Diffusion 1.x or 2.x. Raises BadInput."""
-        ...
-
-    def load_unet(self, dtype: torch.dtype) -> nn.Module:
-        """The U-Net. Raises BadInput for weights that do not fit the config."""
-        ...
-
-    def load_vae(self, dtype: torch.dtype) -> nn.Module:
-        """The VAE without its decoder. Raises BadInput as ``load_unet``."""
-        ...
-
-    def encode_prompt(self, text: str) -> Float[Tensor, "1 l d"]:
-        """The text encoder's last hidden state, float32; frees the encoder. Raises BadInput as ``load_unet``."""
-        ...
 
 
 def open_weights(weights: str, revision: str | None) -> Weights:

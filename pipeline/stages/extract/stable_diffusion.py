@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import torch
 
 from pipeline.backbones.stable_diffusion.features import DiffusionConfigs, DiffusionFeatures, LoadedModel
-from pipeline.backbones.stable_diffusion.source import Weights, open_weights
-from pipeline.io.digests import files_digest
-from pipeline.spec import spec
+from pipeline.backbones.stable_diffusion.source import open_weights
+from pipeline.backbones.stable_diffusion.weights import Weights
+from pipeline.spec import digest, spec
 
 
 @spec
@@ -18,11 +18,11 @@ class StableDiffusion(DiffusionFeatures):
     """Stable Diffusion 1.x or 2.x; the paper reads layers 2, 5, 8 and 11 at timestep 50.
 
     ``weights``: a hub id (with an optional ``revision``), a diffusers folder, or one .safetensors file in the original
-    layout. The recipe holds the digest of the files instead of these two fields.
+    layout. The recipe holds the digest of the content instead of these two fields.
     """
 
     kind: ClassVar[str] = "extract.stable_diffusion"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     weights: str = "stable-diffusion-v1-5/stable-diffusion-v1-5"
     revision: str | None = None
@@ -35,9 +35,8 @@ class StableDiffusion(DiffusionFeatures):
 
     @cached_property
     def weights_digest(self) -> str:
-        """sha256 of all files the features depend on. Raises BadInput."""
-        _ = self.configs  # checked first, so that a folder of another class is refused by its class
-        return files_digest(self.source.files)
+        """sha256 of what features are computed from; a folder and a single file of the same weights have the same."""
+        return self.source.digest()
 
     @property
     def model(self) -> str:
@@ -45,10 +44,16 @@ class StableDiffusion(DiffusionFeatures):
         return f"stable_diffusion-{self.weights_digest[:8]}"
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe, with the weights' digest instead of their location."""
-        recipe = super().recipe() | {"weights": self.weights_digest}
+        """As Spec.recipe, with the digest of the weights and the prompt's tokens instead of files."""
+        recipe = super().recipe() | {"weights": self.weights_digest, "tokens": digest(self.tokens)}
         del recipe["revision"]
         return recipe
+
+    @cached_property
+    def tokens(self) -> list[int]:
+        """Token ids of the prompt. Raises BadInput for a text that needs a tokenizer, or is too long."""
+        ids: list[int] = self.source.tokenize(self.prompt)[0].tolist()
+        return ids
 
     @cached_property
     def configs(self) -> DiffusionConfigs:
