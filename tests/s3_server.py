@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,24 @@ BUCKET = "dzop-tests"
 CREDENTIALS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
 
 
+def _serve_s3() -> Any:
+    """moto's S3 alone, with connections that stay open and no log.
+
+    moto's own server lists moto's folders at every request, to find which service it is for, and opens a connection
+    and a thread for each.
+    """
+    from moto.moto_server.werkzeug_app import MotoRequestHandler, create_backend_app
+    from werkzeug.serving import make_server
+
+    class Handler(MotoRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log_request(self, *args: Any) -> None:
+            return
+
+    return make_server("127.0.0.1", 0, create_backend_app("s3"), threaded=True, request_handler=Handler)
+
+
 @dataclass
 class S3Server:
     endpoint_url: str
@@ -23,18 +42,16 @@ class S3Server:
     @contextmanager
     def running(cls) -> Iterator[S3Server]:
         import boto3
-        from moto.server import ThreadedMotoServer
 
         before = {name: os.environ.get(name) for name in CREDENTIALS}
         os.environ.update(CREDENTIALS)
-        server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-        server.start()
-        host, port = server.get_host_and_port()
-        url = f"http://{host}:{port}"
+        server = _serve_s3()
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
         client = boto3.client("s3", endpoint_url=url)
         client.create_bucket(Bucket=BUCKET)
         yield cls(url, client)
-        server.stop()
+        server.shutdown()
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

@@ -145,18 +145,7 @@ def delete_keys(store: ZarrStore, keys: Sequence[str]) -> None:
 
 def stored_bytes(store: ZarrStore, prefix: str) -> int:
     """Bytes that the keys below ``prefix`` take where they are stored."""
-    keys = list_keys(store, prefix)
-
-    async def size(key: str) -> int:
-        try:
-            return await store.getsize(key)
-        except FileNotFoundError:  # removed since the listing
-            return 0
-
-    async def total() -> int:
-        return sum(await asyncio.gather(*(size(key) for key in keys)))
-
-    return sync(total())
+    return sync(store.getsize_prefix(f"{prefix}/"))
 
 
 def present_rows(store: ZarrStore, array: zarr.Array) -> set[int]:

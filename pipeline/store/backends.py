@@ -8,7 +8,7 @@ import os
 import threading
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -18,10 +18,11 @@ from zarr.abc.store import ByteRequest
 from zarr.abc.store import Store as ZarrStore
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.core.sync import sync
-from zarr.storage import FsspecStore, LocalStore, MemoryStore
+from zarr.storage import LocalStore, MemoryStore
 
 from pipeline.errors import BadInput, DzopError
 from pipeline.spec import PositiveFloat, Spec, spec
+from pipeline.store.bucket import BucketStore
 from pipeline.store.remote import RemoteStore, translate_errors
 
 Announce = Callable[[str], None]
@@ -95,6 +96,14 @@ class _LocalStore(LocalStore):
         for folder, _, names in os.walk(self.root / prefix):
             for name in names:
                 yield (Path(folder) / name).relative_to(self.root).as_posix()
+
+    async def getsize_prefix(self, prefix: str) -> int:
+        """See ZarrStore.getsize_prefix. Files that another process removes meanwhile are no error."""
+        total = 0
+        async for key in self.list_prefix(prefix):
+            with suppress(FileNotFoundError):
+                total += (self.root / key).stat().st_size
+        return total
 
     async def delete_dir(self, prefix: str) -> None:
         """See ZarrStore.delete_dir. What another process removes or adds meanwhile is no error."""
@@ -176,7 +185,7 @@ class S3StoreConfig(Spec):
             raise BadInput("store.url", found=repr(self.url), needed="s3://bucket/prefix")
         logging.getLogger("aiobotocore.credentials").setLevel(logging.WARNING)  # it logs where it found credentials
         try:
-            store = FsspecStore.from_url(self.url.rstrip("/"), storage_options=self._options())
+            store = BucketStore.open_url(self.url.rstrip("/"), self._options())
         except ImportError:
             raise BadInput("store", found="s3 without s3fs", needed="pip install 'dzop[s3]'") from None
         store.fs.retries = 2  # by s3fs, on top of the three attempts by botocore: six requests
@@ -194,10 +203,11 @@ class S3StoreConfig(Spec):
                 "retries": {"total_max_attempts": 3, "mode": "standard"},
             },
             "use_listings_cache": False,  # other workers write there too
+            "max_concurrency": 1,  # within one read: more would cost a request for the size before every read
         }
 
 
-async def _check_bucket(store: FsspecStore, url: str) -> None:
+async def _check_bucket(store: BucketStore, url: str) -> None:
     """List one key, so that a missing or forbidden bucket is reported before any work."""
     bucket, _, prefix = store.path.partition("/")
     with translate_errors(url):

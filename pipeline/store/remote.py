@@ -114,6 +114,10 @@ class RemoteStore(WrapperStore[ZarrStore]):
         """See ZarrStore.getsize."""
         return await self._await(self._store.getsize(key))
 
+    async def getsize_prefix(self, prefix: str) -> int:
+        """See ZarrStore.getsize_prefix."""
+        return await self._await(self._store.getsize_prefix(prefix))
+
     async def is_empty(self, prefix: str) -> bool:
         """See ZarrStore.is_empty."""
         return await self._await(self._store.is_empty(prefix))

@@ -40,28 +40,40 @@ class Killed(BaseException):
 
 
 class Interrupted(WrapperStore):
-    """Calls ``happen`` before every request."""
+    """Calls ``happen`` before every request; what it returns, if anything, is done in another thread meanwhile."""
 
-    def __init__(self, store: Any, happen: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, store: Any, happen: Callable[[], Callable[[], None] | None] = lambda: None) -> None:
         super().__init__(store)
         self.happen = happen
 
+    async def others_act(self) -> None:
+        if (act := self.happen()) is not None:
+            await asyncio.to_thread(act)
+
     async def get(self, *args, **kwargs):
-        await asyncio.to_thread(self.happen)
+        await self.others_act()
         return await super().get(*args, **kwargs)
 
     async def set(self, *args, **kwargs):
-        await asyncio.to_thread(self.happen)
+        await self.others_act()
         return await super().set(*args, **kwargs)
 
+    async def delete(self, *args, **kwargs):
+        await self.others_act()
+        return await super().delete(*args, **kwargs)
+
     async def delete_dir(self, *args, **kwargs):
-        await asyncio.to_thread(self.happen)
+        await self.others_act()
         return await super().delete_dir(*args, **kwargs)
 
     async def list_prefix(self, prefix):
-        await asyncio.to_thread(self.happen)
+        await self.others_act()
         async for key in super().list_prefix(prefix):
             yield key
+
+    async def getsize_prefix(self, prefix):
+        await self.others_act()
+        return await self._store.getsize_prefix(prefix)
 
 
 def numbers(ref: Ref, name: str, row: int, writer: int) -> int:
@@ -123,14 +135,18 @@ class Schedule:
         store, asked = self.connect(), count(1)
         kill_at = self.rng.randrange(1, 60) if mortal and self.rng.random() < 0.25 else 0
 
-        def happen() -> None:
+        def happen() -> Callable[[], None] | None:
             if kill_at and next(asked) >= kill_at:
                 raise Killed
             if not self.locks and self.rng.random() < 0.05 and self.acting.acquire(blocking=False):
-                try:
-                    self.step()
-                finally:
-                    self.acting.release()
+                return step
+            return None
+
+        def step() -> None:
+            try:
+                self.step()
+            finally:
+                self.acting.release()
 
         lock = store.backend.lock if self.locks else lambda key, announce: nullcontext()
         folder = store.backend.folder if self.rng.random() < 0.5 else None  # None: read through Zarr
