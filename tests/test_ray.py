@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from pipeline.store import LocalStoreConfig, Store
+from pipeline.store.leases import live_leases
 from pipeline.synthetic.scenes import write_dataset
 from tests.command import run_dzop, run_dzop_for_module
 from tests.same_bytes import contents, poses
@@ -110,6 +111,7 @@ def test_two_nodes_that_lose_a_worker_write_the_same_bytes_as_one_process(scene,
     ours, theirs = (contents(Store(LocalStoreConfig(root=str(folder / "cache")))) for folder in (tmp_path, local))
     assert set(ours) == set(theirs)
     assert [path for path in ours if ours[path] != theirs[path]] == []
+    assert not live_leases(Store(LocalStoreConfig(root=f"{tmp_path}/cache")).backend.zarr)
     (again,) = run_dzop_for_module(*arguments(scene, tmp_path)).counts()
     assert {computed for computed, _ in again.values()} == {0}
 

@@ -85,13 +85,16 @@ def test_a_failed_job_stops_no_other_and_is_named_at_the_end_and_recorded(dzop, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [JOBLIB, SUBMITIT], ids=["joblib", "submitit"])
-def test_a_failed_job_of_another_launcher_stops_no_other_and_is_recorded(command, dzop, start, tmp_path, launcher):
+def test_a_failed_job_of_another_launcher_stops_no_other_and_is_recorded(
+    command, dzop, start, tmp_path, cache, launcher
+):
     if launcher == SUBMITIT:
         pytest.importorskip("submitit", reason="needs submitit: pip install 'dzop[submitit]'")
     done = start(command("-m", "cluster.count=-1,6", "solve.min_inliers=4", *launcher))
     _, err = done.communicate(timeout=300)
     check_failed_job(done.returncode, err, tmp_path / "results", dzop("step=report"))
     assert len(read_run_records(tmp_path / "results")) == 2
+    assert not list((cache / ".leases").glob("*"))
 
 
 def test_a_nan_fails_only_its_own_job(dzop, tmp_path):

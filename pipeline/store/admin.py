@@ -63,13 +63,12 @@ def list_entries(store: Store) -> list[EntryInfo]:
 
 
 def _describe(store: Store, path: str) -> EntryInfo:
-    attributes = store.attributes(path) or {}
-    record = None if is_newer(attributes) else completion_record(attributes, path.rpartition("/")[2])
+    state, attributes, record = _read_state(store, path)
     made_from = attributes.get("made_from")
     recipe = made_from.get("recipe") if isinstance(made_from, dict) else None
     return EntryInfo(
         path=path,
-        state=_state(store, path, attributes, record),
+        state=state,
         rows=0 if record is None else int(record["rows"]),
         stored_bytes=store.stored_bytes(path),
         age_h=None if record is None else _hours_since(record["at"]),
@@ -79,12 +78,15 @@ def _describe(store: Store, path: str) -> EntryInfo:
     )
 
 
-def _state(store: Store, path: str, attributes: Mapping[str, Any], record: Mapping[str, Any] | None) -> str:
-    if record is not None:
-        return COMPLETE
+def _read_state(store: Store, path: str) -> tuple[str, Mapping[str, Any], Mapping[str, Any] | None]:
+    """State, attributes and completion record of an entry."""
+    attributes = store.attributes(path) or {}
     if is_newer(attributes):
-        return NEWER
-    return INCOMPLETE if store.is_ours(path) else FOREIGN
+        return NEWER, attributes, None
+    record = completion_record(attributes, path.rpartition("/")[2])
+    if record is not None:
+        return COMPLETE, attributes, record
+    return INCOMPLETE if store.is_ours(path) else FOREIGN, attributes, None
 
 
 def _hours_since(time: str) -> float:
@@ -151,12 +153,12 @@ def collect_garbage(store: Store, *, older_than_h: float | None, dry_run: bool) 
 def _remove(store: Store, entry: EntryInfo) -> bool:
     """Remove an entry unless it was completed, or a process began to use it, since it was listed."""
     with store.backend.lock(entry.key, store.announce):
-        keys, before = list_keys(store.backend.zarr, entry.path), store.attributes(entry.path)
-        if _describe(store, entry.path).state != entry.state:
+        keys, (state, before, _) = list_keys(store.backend.zarr, entry.path), _read_state(store, entry.path)
+        if state != entry.state:
             return False
         withdraw(store.backend, entry.path)  # whoever takes a lease from now on finds no complete entry
         if entry.key in live_leases(store.backend.zarr):
-            if before is not None:
+            if before:
                 write_attributes(store.backend.zarr, entry.path, before)
             store.announce(f"{entry.path}: kept: a process has just begun to use it")
             return False
@@ -180,7 +182,7 @@ def _remove_leftovers(store: Store, entry: EntryInfo) -> None:
 
 
 def _is_older(entry: EntryInfo, hours: float | None) -> bool:
-    return hours is not None and (entry.age_h or 0.0) > hours
+    return hours is not None and (entry.age_h or 0.0) >= hours
 
 
 def find_entry(store: Store, prefix: str) -> EntryInfo:

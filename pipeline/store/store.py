@@ -84,9 +84,9 @@ class Store:
         try:
             yield
         finally:
-            if self.lease is not None:
-                self.lease.release()
-            self.lease = None
+            lease, self.lease = self.lease, None
+            if lease is not None:
+                lease.release()
 
     def join_lease(self, name: str) -> None:
         """Lease every entry from now on. ``name``: the lease of the process that started this one, "" for a new one."""
@@ -125,8 +125,14 @@ class Store:
         return completion_record(attributes, ref.key)
 
     def _take_lease(self, ref: Ref) -> None:
-        if self.lease is not None:
-            self.lease.take(ref.key)
+        lease = self.lease  # threads may still read when the run ends
+        if lease is not None:
+            lease.take(ref.key)
+
+    def _keep_lease(self) -> None:
+        lease = self.lease
+        if lease is not None:
+            lease.refresh()
 
     # --- reading ---------------------------------------------------------------------------------------------------
 
@@ -145,8 +151,7 @@ class Store:
             self._used.pop(ref, None)
         else:
             self._used[ref] = content_of(record)
-        if self.lease is not None:
-            self.lease.refresh()
+        self._keep_lease()
 
     def _check_used(self) -> None:
         """Raise DamagedEntry if an entry that was used since the last call is no longer complete, or has other arrays.
@@ -210,6 +215,7 @@ class Store:
             with _note_on_error(writers):
                 for batch_rows in _split(rows, batch):
                     computed += _compute_missing(writers, batch_rows, compute)
+                    self._keep_lease()
                     advance(len(batch_rows))
                 if writers:
                     self._check_used()

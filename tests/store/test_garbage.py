@@ -198,21 +198,6 @@ def test_a_process_that_comes_while_gc_removes_an_entry_keeps_it_or_finds_none(s
     np.testing.assert_array_equal(user.read(REF).array("maps"), np.full((ROWS, 3), 1.5))
 
 
-def test_leases_of_a_killed_process_expire(tmp_path: Path, monkeypatch):
-    store = Store(LocalStoreConfig(root=str(tmp_path)))
-    fill(store)
-    code = (
-        "import os, sys; from pipeline.store import LocalStoreConfig, Store; "
-        "from tests.store.test_garbage import REF; "
-        f"s = Store(LocalStoreConfig(root={str(tmp_path)!r})); s.join_lease(''); s.read(REF); os.kill(os.getpid(), 9)"
-    )
-    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False)
-    assert removed(store) == set()
-    monkeypatch.setattr(pipeline.store.leases, "LIFETIME_S", -1.0)
-    assert removed(store) == {REF.path}
-    assert not list((tmp_path / ".leases").rglob("*"))
-
-
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"at": "noon"}', b'{"at": 1e999}', b'{"at": null}'])
 def test_a_damaged_lease_protects_nothing_and_is_no_traceback(tmp_path: Path, content: bytes):
     store = Store(LocalStoreConfig(root=str(tmp_path)))
