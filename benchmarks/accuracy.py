@@ -59,8 +59,8 @@ def benchmark(
     results = folder / "results" / digest(list(overrides))[:8] if overrides else folder / "results"
     cores = cpu_count()
     jobs = min(jobs or cores, len(datasets) * len(SYSTEMS))
-    shared = [*QUIET, f"threads={max(1, cores // jobs)}", _path_override("store.root", folder / "cache")]
-    outs = {(title, name): results / _folder_name(title) / _folder_name(name) for title in datasets for name in SYSTEMS}
+    shared = [*QUIET, f"threads={max(1, cores // jobs)}", path_override("store.root", folder / "cache")]
+    outs = {(title, name): results / folder_name(title) / folder_name(name) for title in datasets for name in SYSTEMS}
     overrides_of = {
         (title, name): [
             "method=dzop_x",
@@ -68,7 +68,7 @@ def benchmark(
             *shared,
             *datasets[title],
             *overrides,
-            _path_override("out", out),
+            path_override("out", out),
         ]
         for (title, name), out in outs.items()
     }
@@ -80,13 +80,13 @@ def benchmark(
 def _dataset_overrides(folder: Path, lmo: Path | None, detections: Path | None) -> dict[str, tuple[str, ...]]:
     """Title of a table -> overrides that choose its data."""
     chosen: dict[str, tuple[str, ...]] = {
-        "objects of the test seed": (*DEMO, _path_override("dataset.root", folder / "data"))
+        "objects of the test seed": (*DEMO, path_override("dataset.root", folder / "data"))
     }
     if lmo is not None:
-        masks = ("dataset=lmo", _path_override("dataset.root", lmo), "evaluate.vsd=false")
+        masks = ("dataset=lmo", path_override("dataset.root", lmo), "evaluate.vsd=false")
         chosen["LM-O, visible masks"] = masks
         if detections is not None:
-            chosen["LM-O, detections"] = (*masks, "detect=json", _path_override("detect.path", detections))
+            chosen["LM-O, detections"] = (*masks, "detect=json", path_override("detect.path", detections))
     return chosen
 
 
@@ -95,32 +95,34 @@ def _table(title: str, records: Mapping[str, RunRecord]) -> str:
     recalls = [k for k, name in enumerate(RECALLS) if records[OURS].metrics.get(name) is not None]
     heads = ["features", *TEMPLATE_COLUMNS.values(), *(RECALLS[k] for k in recalls), "mean", f"lead of {OURS}"]
     lines = [f"**{title}**", "", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    ours = _recalls(records[OURS], recalls)
+    ours = read_recalls(records[OURS], recalls)
     for name, record in records.items():
-        values = _recalls(record, recalls)
+        values = read_recalls(record, recalls)
         cells = [_number_text(record.metrics.get(column)) for column in TEMPLATE_COLUMNS]
-        cells += [_interval_text(column, record) for column in (*values.T, values.mean(axis=1))]
-        cells.append("" if name == OURS else _interval_text((ours - values).mean(axis=1), record))
+        cells += [interval_text(column, record) for column in (*values.T, values.mean(axis=1))]
+        cells.append("" if name == OURS else interval_text((ours - values).mean(axis=1), record))
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def _path_override(field: str, path: Path) -> str:
+def path_override(field: str, path: Path) -> str:
     """An override whose value is a path with any characters."""
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
     return f'{field}="{escaped}"'
 
 
-def _folder_name(title: str) -> str:
+def folder_name(title: str) -> str:
+    """A title as the name of a folder."""
     return title.replace(",", "").replace(" ", "_")
 
 
-def _recalls(record: RunRecord, which: Sequence[int]) -> np.ndarray:
+def read_recalls(record: RunRecord, which: Sequence[int]) -> np.ndarray:
     """Recalls of each instance, (instances, metrics)."""
     return instance_recalls(record.require_scores())[:, which]
 
 
-def _interval_text(values: np.ndarray, record: RunRecord) -> str:
+def interval_text(values: np.ndarray, record: RunRecord) -> str:
+    """Mean of the instances' values and its 95 % interval over images."""
     scores = record.require_scores()
     interval = mean_interval(values, image_index(scores.scene_id, scores.im_id))
     return f"{interval.mean:.3f} [{interval.low:.3f}, {interval.high:.3f}]"

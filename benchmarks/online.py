@@ -136,7 +136,7 @@ class Plain:
         features = {layer: m.float().cpu().numpy() for layer, m in t.crop.maps.items()}
         return features, t.crop.mask.cpu().numpy(), t.A_crop_img, t.depth_mm, t.K, t.T_cam_obj
 
-    def pose(self) -> tuple[int, np.ndarray]:
+    def pose(self, reading: reference.Reading = reference.DZOP) -> tuple[int, np.ndarray]:
         """The reference's template and pose."""
-        q = self.made.query
-        return reference.pose(self.query, self.query_mask, q.A_crop_img, q.K, self.bank, self.view, dims=self.dims)
+        q, masked = self.made.query, (self.query, self.query_mask)
+        return reference.pose(*masked, q.A_crop_img, q.K, self.bank, self.view, dims=self.dims, reading=reading)

@@ -1,5 +1,7 @@
 """A complete set of stages that benchmarks and tests start from; change fields with ``dataclasses.replace``."""
 
+from dataclasses import replace
+
 from pipeline.method import Stages
 from pipeline.stages.choose.inliers import Inliers
 from pipeline.stages.cluster.kmeans import KMeans
@@ -27,3 +29,13 @@ PAPER = Stages(
     detect=GtMask(),
 )
 """The stages of method=dzop_sd, with pixels in place of the Stable Diffusion features."""
+
+LETTER = replace(
+    PAPER,
+    crop=Square(padding_ratio=1.0),
+    fuse=Pca(normalise=False, cells="all"),
+    cluster=KMeans(planar="fundamental"),
+    correspond=Corresponder(mutual=False, subtract_own_shift=False),
+    solve=Epnp(iterations=100, confidence=0.99, refine=False),
+)
+"""Those of method=dzop_paper."""

@@ -1,13 +1,14 @@
 """The paper's online path, written plainly with scikit-learn, SciPy and OpenCV; reference for speed and correctness.
 
-Von Gimborn et al., "Diffusion Features for Zero-Shot 6DoF Object Pose Estimation", in the reading of
-``method=dzop_sd``: the defaults of match=cosine, fuse=pca, cluster=kmeans, correspond=cosine and solve=epnp. It shares
-no code with the package, uses numpy arrays, and prefers clarity to speed.
+Von Gimborn et al., "Diffusion Features for Zero-Shot 6DoF Object Pose Estimation", in two readings: ``DZOP`` is that of
+``method=dzop``, the defaults of match=cosine, fuse=pca, cluster=kmeans, correspond=cosine and solve=epnp; ``LETTER`` is
+that of ``method=dzop_paper``. It shares no code with the package, uses numpy arrays, and prefers clarity to speed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,6 +23,27 @@ Map = Float[np.ndarray, "c h w"]
 Cells = Bool[np.ndarray, "h w"]
 View = tuple[Mapping[int, Map], Bool[np.ndarray, "S S"], np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """features by layer, mask, A_crop_img, depth (mm), K and T_cam_obj of a template"""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the paper leaves open, or ``method=dzop`` adds to it; fields as in conf/method/dzop_paper.yaml."""
+
+    normalise: bool = True
+    all_cells: bool = False
+    planar: str = "skip"
+    mutual: bool = True
+    subtract_own_shift: bool = True
+    iterations: int = 400
+    confidence: float = 0.999
+    refine: bool = True
+
+
+DZOP = Reading()
+LETTER = Reading(
+    normalise=False, all_cells=True, planar="fundamental", mutual=False, subtract_own_shift=False,
+    iterations=100, confidence=0.99, refine=False,
+)  # fmt: skip
 
 
 def retrieve(query: Map, bank: Float[np.ndarray, "n c h w"]) -> Float[np.ndarray, " n"]:
@@ -46,17 +68,19 @@ def co_project(
     template_mask: Bool[np.ndarray, "S S"],
     *,
     dims: Mapping[int, int],
+    reading: Reading = DZOP,
 ) -> tuple[Map, Map]:
-    """Joint PCA by layer, scaled to unit root mean square length, upsampled to the finest layer, concatenated."""
+    """Joint PCA by layer, upsampled to the finest layer, concatenated; scaled to unit root mean square if so read."""
     finest = max(m.shape[-1] for m in query.values())
     blocks: tuple[list[Map], list[Map]] = ([], [])
     for layer, dim in dims.items():
         cells = query[layer].shape[-1]
-        inside = [cell_mask(mask, cells) for mask in (query_mask, template_mask)]
+        masks = [np.ones_like(mask) if reading.all_cells else mask for mask in (query_mask, template_mask)]
+        inside = [cell_mask(mask, cells) for mask in masks]
         sides = [m[layer].astype(np.float64) for m in (query, template)]
         samples = np.concatenate([cells_inside(m, mask) for m, mask in zip(sides, inside, strict=True)])
         pca = PCA(n_components=dim, svd_solver="full").fit(samples)
-        scale = np.sqrt(np.mean(np.sum(pca.transform(samples) ** 2, axis=1)))
+        scale = np.sqrt(np.mean(np.sum(pca.transform(samples) ** 2, axis=1))) if reading.normalise else 1.0
         for block, m in zip(blocks, sides, strict=True):
             flat = pca.transform(m.reshape(len(m), -1).T) / scale
             block.append(cv2.resize(flat.reshape(cells, cells, dim), (finest, finest), interpolation=cv2.INTER_LINEAR))
@@ -91,17 +115,25 @@ def pair_clusters(
     return np.array([(i, j) for i, j in enumerate(best) if back[j] == i])
 
 
-def consistent_pairs(a: Float[np.ndarray, "p 2"], b: Float[np.ndarray, "p 2"], *, threshold: float, seed: int) -> Cells:
-    """Mask of pairs consistent with a fundamental matrix; all pairs if a homography explains them about as well."""
+def consistent_pairs(
+    a: Float[np.ndarray, "p 2"], b: Float[np.ndarray, "p 2"], *, threshold: float, seed: int, planar: str = "skip"
+) -> Bool[np.ndarray, " p"]:
+    """Mask of pairs consistent with a fundamental matrix. ``planar``: what if a homography explains them about as well.
+
+    ``skip``: all pairs; ``homography``: those consistent with it; ``fundamental``: as for any other set.
+    """
     order = np.random.default_rng(seed).permutation(len(a))
-    everything = np.ones(len(a), dtype=bool)
+    everything, kept = np.ones(len(a), dtype=bool), np.zeros(len(a), dtype=bool)
     if len(a) < 8:
         return everything
     F, agree = cv2.findFundamentalMat(a[order], b[order], cv2.FM_RANSAC, threshold, 0.99, 1000)
-    H, planar = cv2.findHomography(a[order], b[order], cv2.RANSAC, threshold, maxIters=200, confidence=0.99)
-    if F is None or agree.sum() < 8 or (H is not None and planar.sum() >= 0.8 * agree.sum()):
+    if F is None or agree.sum() < 8:
         return everything
-    kept = np.zeros(len(a), dtype=bool)
+    H, on_plane = cv2.findHomography(a[order], b[order], cv2.RANSAC, threshold, maxIters=200, confidence=0.99)
+    if planar != "fundamental" and H is not None and on_plane.sum() >= 0.8 * agree.sum():
+        if planar == "skip":
+            return everything
+        agree = on_plane
     kept[order[agree[:, 0] > 0]] = True
     return kept
 
@@ -115,7 +147,14 @@ def label_map(features: Map, mask: Cells, *, count: int, seed: int, iterations: 
 
 
 def cluster(
-    query: Map, template: Map, query_mask: Cells, template_mask: Cells, *, count: int = 200, iterations: int = 20
+    query: Map,
+    template: Map,
+    query_mask: Cells,
+    template_mask: Cells,
+    *,
+    count: int = 200,
+    iterations: int = 20,
+    reading: Reading = DZOP,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Labels of both maps, and the matched pairs of clusters."""
     query_label, query_centres = label_map(query, query_mask, count=count, seed=0, iterations=iterations)
@@ -125,7 +164,8 @@ def cluster(
         np.array([np.argwhere(label == k)[:, ::-1].mean(axis=0) for k in pairs[:, side]])
         for side, label in enumerate((query_label, template_label))
     ]
-    return query_label, template_label, pairs[consistent_pairs(*middle, threshold=2.0, seed=0)]
+    kept = consistent_pairs(*middle, threshold=2.0, seed=0, planar=reading.planar)
+    return query_label, template_label, pairs[kept]
 
 
 def sub_pixel(
@@ -153,8 +193,9 @@ def correspond(
     *,
     crop_size: int,
     per_cluster: int = 10,
+    reading: Reading = DZOP,
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Crop pixels in query and template: the most similar mutual nearest neighbours of each cluster pair."""
+    """Crop pixels in query and template: the most similar nearest neighbours of each cluster pair."""
     q = normalize(query.reshape(len(query), -1).T).reshape(*query.shape[1:], -1)
     t = normalize(template.reshape(len(template), -1).T).reshape(*template.shape[1:], -1)
     stride = crop_size / query.shape[-1]
@@ -166,12 +207,14 @@ def correspond(
         )
         similarity = cosine_similarity(q[tuple(query_cells.T)], t[tuple(template_cells.T)])
         forward, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-        found = [(similarity[i, j], i, j) for i, j in enumerate(forward) if back[j] == i and similarity[i, j] > 0]
+        both_ways = [(i, j) for i, j in enumerate(forward) if not reading.mutual or back[j] == i]
+        found = [(similarity[i, j], i, j) for i, j in both_ways if similarity[i, j] > 0]
         found.sort(key=lambda match: -match[0])
         for _, i, j in found[:per_cluster]:
             (y, x), (row, column) = query_cells[i], template_cells[j]
             shift = sub_pixel(q[y, x], t, template_mask, row, column)
-            shift = shift - sub_pixel(t[row, column], t, template_mask, row, column)
+            if reading.subtract_own_shift:
+                shift = shift - sub_pixel(t[row, column], t, template_mask, row, column)
             query_px.append((np.array([x, y]) + 0.5) * stride - 0.5)
             template_px.append((np.array([column, row]) + shift + 0.5) * stride - 0.5)
     return np.array(query_px), np.array(template_px)
@@ -193,15 +236,20 @@ def object_point(
 
 
 def solve(
-    points_obj: Float[np.ndarray, "m 3"], px: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"], *, seed: int = 0
+    points_obj: Float[np.ndarray, "m 3"],
+    px: Float[np.ndarray, "m 2"],
+    K: Float[np.ndarray, "3 3"],
+    *,
+    seed: int = 0,
+    reading: Reading = DZOP,
 ) -> Float[np.ndarray, "4 4"]:
-    """RANSAC EPnP, then three rounds of Levenberg-Marquardt on the inliers."""
+    """RANSAC EPnP, then three rounds of Levenberg-Marquardt on the inliers if so read."""
     order = np.random.default_rng(seed).permutation(len(points_obj))
     _, rvec, tvec, _ = cv2.solvePnPRansac(
-        points_obj[order], px[order], K, None, iterationsCount=400, reprojectionError=8.0, confidence=0.999,
-        flags=cv2.SOLVEPNP_EPNP,
+        points_obj[order], px[order], K, None, iterationsCount=reading.iterations, reprojectionError=8.0,
+        confidence=reading.confidence, flags=cv2.SOLVEPNP_EPNP,
     )  # fmt: skip
-    for _ in range(3):
+    for _ in range(3 if reading.refine else 0):
         projected = cv2.projectPoints(points_obj, rvec, tvec, K, None)[0][:, 0]
         near = np.linalg.norm(projected - px, axis=1) < 8.0
         rvec, tvec = cv2.solvePnPRefineLM(points_obj[near], px[near], K, None, rvec, tvec)
@@ -219,18 +267,19 @@ def pose(
     view: Callable[[int], View],
     *,
     dims: Mapping[int, int],
+    reading: Reading = DZOP,
 ) -> tuple[int, Float[np.ndarray, "4 4"]]:
     """The best template and T_cam_obj (mm)."""
     best = int(retrieve(query[2], bank).argmax())
     template, template_mask, A_template, depth_mm, K_template, T_template = view(best)
-    query_map, template_map = co_project(query, template, query_mask, template_mask, dims=dims)
+    query_map, template_map = co_project(query, template, query_mask, template_mask, dims=dims, reading=reading)
     masks = [cell_mask(mask, query_map.shape[-1]) for mask in (query_mask, template_mask)]
-    query_label, template_label, pairs = cluster(query_map, template_map, *masks)
+    clusters = cluster(query_map, template_map, *masks, reading=reading)
     query_px, template_px = correspond(
-        query_map, template_map, masks[1], query_label, template_label, pairs, crop_size=len(query_mask)
+        query_map, template_map, masks[1], *clusters, crop_size=len(query_mask), reading=reading
     )
     points_obj = np.array([object_point(px, A_template, depth_mm, K_template, T_template) for px in template_px])
     seen = np.isfinite(points_obj).all(axis=1)
     A_img_crop = np.linalg.inv(A_crop_img)
     px_img = np.array([(A_img_crop @ [*px, 1.0])[:2] for px in query_px])
-    return best, solve(points_obj[seen], px_img[seen], K)
+    return best, solve(points_obj[seen], px_img[seen], K, reading=reading)

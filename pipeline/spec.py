@@ -20,6 +20,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from hashlib import sha256
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, dataclass_transform
 
 from pydantic import ConfigDict, Field, ValidationError
@@ -60,16 +61,18 @@ class Spec:
 
     kind: ClassVar[str]
     version: ClassVar[int] = 1
+    added: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    """Fields that came after the version -> the value that means what the version did before they came."""
 
     def recipe(self) -> dict[str, Any]:
         """Everything except the inputs that the result depends on, as JSON-able values.
 
+        A field in ``added`` is left out at its value there, so that a new switch orphans no cache entry.
         Specs with a path among their fields override this to hash the file's contents instead of its location.
         """
-        return {"kind": self.kind, "version": self.version} | {
-            f.name: _to_jsonable(getattr(self, f.name))
-            for f in fields(self)  # type: ignore[arg-type]
-        }
+        values = {f.name: _to_jsonable(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
+        unchanged = {name for name, before in self.added.items() if values[name] == before}
+        return {"kind": self.kind, "version": self.version} | {k: v for k, v in values.items() if k not in unchanged}
 
 
 def _to_jsonable(value: Any) -> Any:

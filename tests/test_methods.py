@@ -18,6 +18,7 @@ METHODS = {
     "dzop": (),
     "dzop_x": (),
     "dzop_sd": ("extract.input_size=256",),
+    "dzop_paper": ("extract=stable_diffusion", "extract.input_size=256"),
     "zs6d": ("extract.input_size=112",),
     "foundpose": ("extract.input_size=112", "crop.size=96", "render.inplane=1", "match.count=50"),
     "fusion": ("extract.first.input_size=256", "extract.second.input_size=112"),

@@ -1,13 +1,18 @@
 """The package's steps against the paper written plainly with scikit-learn, SciPy, OpenCV: benchmarks/reference.py."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from benchmarks import reference
 from benchmarks.inputs import TOY, scene
 from benchmarks.online import Plain
-from benchmarks.presets import PAPER
+from benchmarks.presets import LETTER, PAPER
+from pipeline.configuration import build_stages
 from pipeline.functional import camera, rigid
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import cell_mask, foreground
@@ -86,9 +91,58 @@ def test_correspondences_in_given_clusters_are_the_references(pair):
     assert np.mean(off < 1e-3) > 0.99
 
 
-def test_the_whole_route_ends_at_the_references_pose(made, plain):
-    best = trace_pose(PAPER, made.query, made.bank).best
-    template_id, T_reference = plain.pose()
+READINGS = [pytest.param(PAPER, reference.DZOP, id="dzop"), pytest.param(LETTER, reference.LETTER, id="dzop_paper")]
+
+
+def cells_of_pairs(query_label, template_label, pairs) -> set[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Cells of both clusters of every pair."""
+    labels = query_label.ravel(), template_label.ravel()
+    return {tuple(tuple(np.flatnonzero(label == k)) for label, k in zip(labels, pair, strict=True)) for pair in pairs}
+
+
+@pytest.mark.parametrize(("stages", "reading"), READINGS)
+def test_features_lead_to_the_references_clusters_and_correspondences(made, plain, stages, reading):
+    template, template_mask, *_ = plain.view(0)
+    maps = reference.co_project(
+        plain.query, template, plain.query_mask, template_mask, dims=plain.dims, reading=reading
+    )
+    masks = [reference.cell_mask(mask, maps[0].shape[-1]) for mask in (plain.query_mask, template_mask)]
+    their_clusters = reference.cluster(*maps, *masks, reading=reading)
+    theirs = reference.correspond(*maps, masks[1], *their_clusters, crop_size=128, reading=reading)
+
+    pair = stages.fuse(made.query.crop, made.bank.view(0).crop)
+    clusters = stages.cluster(pair)
+    ours = stages.correspond(pair, clusters, crop_size=128)
+    labels = clusters.query_label.numpy(), clusters.template_label.numpy(), clusters.pairs.numpy()
+    assert cells_of_pairs(*labels) == cells_of_pairs(*their_clusters)
+    np.testing.assert_array_equal(ours.query_px.numpy(), theirs[0])
+    np.testing.assert_allclose(ours.template_px.numpy(), theirs[1], atol=1e-4)  # px; float32 weights against float64
+
+
+@pytest.mark.parametrize(("stages", "reading"), READINGS)
+def test_the_same_points_give_the_references_pose(stages, reading):
+    points, K = (
+        np.random.default_rng(0).uniform(-50, 50, (80, 3)),
+        np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]),
+    )
+    px = camera.project(K, rigid.transform(rigid.look_at(np.array([300.0, 200.0, 250.0])), points))
+    px[::4] += 60.0
+    ours = stages.solve(points, px, K).T_cam_obj
+    np.testing.assert_allclose(ours, reference.solve(points, px, K, reading=reading), atol=1e-6)
+
+
+def test_the_preset_is_the_yaml():
+    with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
+        config = compose("config", overrides=["method=dzop_paper", "extract=hog"])
+    stages = build_stages(OmegaConf.to_container(config, resolve=True))
+    for name in ("crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine"):
+        assert getattr(stages, name) == getattr(LETTER, name), name
+
+
+@pytest.mark.parametrize(("stages", "reading"), READINGS)
+def test_the_whole_route_ends_at_the_references_pose(made, plain, stages, reading):
+    best = trace_pose(stages, made.query, made.bank).best
+    template_id, T_reference = plain.pose(reading)
     assert best.template_id == template_id == 0
     assert best.solution is not None
     points = best.points_obj[best.solution.inliers]
@@ -96,6 +150,6 @@ def test_the_whole_route_ends_at_the_references_pose(made, plain):
         camera.project(made.query.K, rigid.transform(T, points))
         for T in (best.solution.T_cam_obj, T_reference, made.T_true)
     )
-    # RANSAC's draws differ; both polish on the inliers
+    # matches of equal similarity may be listed in another order, and RANSAC then draws others
     assert np.median(np.linalg.norm(ours - theirs, axis=1)) < 0.3
     assert np.median(np.linalg.norm(ours - true, axis=1)) < 1.5

@@ -1,9 +1,12 @@
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 import pytest
 
 from pipeline.errors import BadInput
 from pipeline.spec import NonNegative, Positive, Spec, build, canonical, digest, spec
+from pipeline.stages.cluster.kmeans import KMeans
+from pipeline.stages.correspond.cosine import Cosine
 from pipeline.stages.fuse.template_pca import TemplatePca
 
 
@@ -35,6 +38,28 @@ def test_every_field_enters_the_recipe():
         "flag": True,
     }
     assert Toy().recipe() == recipe
+
+
+@spec
+class WithLaterFields(Spec):
+    kind: ClassVar[str] = "match.toy"
+    added: ClassVar[Mapping[str, Any]] = {"mode": "off", "size": 3}
+    layer: NonNegative = 2
+    mode: Literal["off", "on"] = "off"
+    size: Positive = 3
+
+
+def test_a_field_added_later_keeps_the_key_at_the_value_that_changes_nothing():
+    before = {"kind": "match.toy", "version": 1, "layer": 2}
+    assert WithLaterFields().recipe() == before
+    assert WithLaterFields(mode="on").recipe() == before | {"mode": "on"}
+    assert WithLaterFields(size=4).recipe() == before | {"size": 4}
+    assert WithLaterFields(layer=5, mode="on", size=1).recipe() == before | {"layer": 5, "mode": "on", "size": 1}
+
+
+@pytest.mark.parametrize("cls", [KMeans, Cosine])
+def test_fields_added_later_exist_and_default_to_what_was_before(cls):
+    assert {name: getattr(cls(), name) for name in cls.added} == dict(cls.added)
 
 
 def test_nested_specs_enter_with_kind_and_version():

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+
+PlanarMode = Literal["skip", "fundamental", "homography"]
 
 _MIN_PAIRS = 8  # seven pairs determine a fundamental matrix, so seven always agree
 _PLANAR = 0.8  # homography inliers / epipolar inliers; ORB-SLAM (Mur-Artal, T-RO 2015) uses a ratio equivalent to 0.82
@@ -19,28 +23,32 @@ def epipolar_inliers(
     threshold: float,
     iterations: int,
     seed: int,
+    planar: PlanarMode = "skip",
 ) -> tuple[Bool[np.ndarray, " p"] | None, str]:
     """Inliers within ``threshold`` pixels of their epipolar lines under a RANSAC fundamental matrix, and "".
 
-    Returns None and the reason if no fundamental matrix is found or it is not determined: fewer than 8 pairs, nearly
-    collinear points, or pairs that a homography explains equally well (a planar object, or almost no baseline). The
-    seed shuffles the pairs because OpenCV's RANSAC ignores cv2.setRNGSeed.
+    Returns None and the reason where no fundamental matrix is found: fewer than 8 pairs, or 8 that agree. ``planar`` is
+    for pairs that do not determine it, because a homography explains them equally well (a planar object, or almost no
+    baseline) or because points are nearly collinear: ``skip`` returns None and the reason; ``homography`` returns the
+    inliers of the homography, None for collinear points; ``fundamental`` returns those of the matrix that was found.
+    The seed shuffles the pairs because OpenCV's RANSAC ignores cv2.setRNGSeed.
     """
     if len(a) < _MIN_PAIRS:
         return None, f"{len(a)} pairs, a fundamental matrix needs {_MIN_PAIRS}"
-    if min(_spread_ratio(a), _spread_ratio(b)) < _COLLINEAR:
+    if planar != "fundamental" and min(_spread_ratio(a), _spread_ratio(b)) < _COLLINEAR:
         return None, "points nearly on a line"
     order = np.random.default_rng(seed).permutation(len(a))
     x, y = np.ascontiguousarray(a[order]), np.ascontiguousarray(b[order])
     F, agree = cv2.findFundamentalMat(x, y, cv2.FM_RANSAC, threshold, 0.99, iterations)
     if F is None or agree is None or agree.sum() < _MIN_PAIRS:
         return None, f"no fundamental matrix that {_MIN_PAIRS} of {len(a)} pairs agree with"
-    H, planar = cv2.findHomography(x, y, cv2.RANSAC, threshold, maxIters=_PLANAR_ITERATIONS, confidence=0.99)
-    if H is not None and planar.sum() >= _PLANAR * agree.sum():
-        return (
-            None,
-            f"near-planar: {planar.sum()} pairs agree with a homography, {agree.sum()} with a fundamental matrix",
-        )
+    if planar != "fundamental":
+        H, on_plane = cv2.findHomography(x, y, cv2.RANSAC, threshold, maxIters=_PLANAR_ITERATIONS, confidence=0.99)
+        if H is not None and on_plane.sum() >= _PLANAR * agree.sum():
+            if planar == "skip":
+                with_plane = f"{on_plane.sum()} pairs agree with a homography"
+                return None, f"near-planar: {with_plane}, {agree.sum()} with a fundamental matrix"
+            agree = on_plane
     inliers = np.zeros(len(a), dtype=bool)
     inliers[order] = agree[:, 0].astype(bool)
     return inliers, ""

@@ -14,19 +14,23 @@ def neighbourhood_shift(
     cell: Int[Tensor, " m"],
     *,
     kernel: int,
+    subtract_own: bool = True,
 ) -> Float[Tensor, "m 2"]:
     """Shift (x, y), in cells, from the centres of template cells (flat indices) to where the query feature fits best.
 
     Similarity-weighted mean of the offsets in the ``kernel`` x ``kernel`` neighbourhood (von Gimborn et al., last
     equation of the method), not rounded. Features have unit length; weights are max(cosine, 0); neighbours outside the
-    mask have weight 0. Departure from the paper: the shift computed for the template cell's own feature, which should
-    be 0, is subtracted. Otherwise points near silhouettes move inwards, and a perfect match by a tenth of a cell.
+    mask have weight 0. ``subtract_own``, a departure from the paper: the shift computed for the template cell's own
+    feature, which should be 0, is subtracted. Otherwise points near silhouettes move inwards, and a perfect match by a
+    tenth of a cell.
     """
     offset, index, valid = _neighbourhoods(mask, cell, kernel=kernel)
     flat = template.flatten(0, 1)
     neighbours = flat.index_select(0, index.flatten()).unflatten(0, index.shape)
-    own_feature = flat.index_select(0, cell)
-    return _mean_offset(query, neighbours, valid, offset) - _mean_offset(own_feature, neighbours, valid, offset)
+    shift = _mean_offset(query, neighbours, valid, offset)
+    if not subtract_own:
+        return shift
+    return shift - _mean_offset(flat.index_select(0, cell), neighbours, valid, offset)
 
 
 def _mean_offset(

@@ -6,6 +6,7 @@ import runpy
 import subprocess
 import sys
 import tomllib
+from functools import partial, partialmethod
 from pathlib import Path
 
 import pytest
@@ -106,13 +107,14 @@ def check_arguments(arguments: list[str], monkeypatch) -> None:
 
 def check_parser(monkeypatch, call) -> None:
     """``call`` gets as far as having read its arguments."""
-    parse = argparse.ArgumentParser.parse_args
 
-    def parse_and_stop(self, *args, **kwargs):
+    def parse_and_stop(parse, self, *args, **kwargs):
         parse(self, *args, **kwargs)
         raise Parsed
 
-    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
+    for name in ("parse_args", "parse_intermixed_args"):
+        parse = getattr(argparse.ArgumentParser, name)
+        monkeypatch.setattr(argparse.ArgumentParser, name, partialmethod(partial(parse_and_stop, parse)))
     with pytest.raises(Parsed):
         call()
 

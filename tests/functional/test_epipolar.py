@@ -46,3 +46,39 @@ def test_degenerate_configurations_are_reported(a, b, reason):
     keep, said = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0)
     assert keep is None
     assert said.startswith(reason)
+
+
+@pytest.mark.parametrize("depth_range", [0.0, 0.02, 0.05])
+def test_a_near_planar_set_is_skipped_or_checked_as_asked(depth_range):
+    a, b = _two_views(depth_range)
+    wrong = np.arange(30)
+    b[wrong] = np.random.default_rng(1).uniform(5, 60, (30, 2))
+    checked = {
+        planar: epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0, planar=planar)
+        for planar in ("skip", "fundamental", "homography")
+    }
+    assert checked["skip"][0] is None
+    for planar in ("fundamental", "homography"):
+        keep, reason = checked[planar]
+        assert reason == ""
+        assert keep[30:].mean() > 0.95
+        assert keep[:30].mean() < 0.2
+    # a plane fixes both coordinates of a point, an epipolar line one
+    assert checked["homography"][0][:30].sum() <= checked["fundamental"][0][:30].sum()
+
+
+@pytest.mark.parametrize("planar", ["fundamental", "homography"])
+def test_a_set_with_depth_is_checked_by_the_fundamental_matrix_whatever_planar_is(planar):
+    a, b = _two_views(depth_range=1.0)
+    b[:30] = np.random.default_rng(1).uniform(5, 60, (30, 2))
+    expected, _ = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0)
+    keep, _ = epipolar_inliers(a, b, threshold=1.0, iterations=1000, seed=0, planar=planar)
+    assert np.array_equal(keep, expected)
+
+
+@pytest.mark.parametrize("planar", ["fundamental", "homography"])
+@pytest.mark.parametrize("points", [np.ones((20, 2)), np.arange(20.0)[:, None] * [1, 2], np.ones((7, 2))])
+def test_no_matrix_is_said_and_not_an_error(planar, points):
+    keep, reason = epipolar_inliers(points, points, threshold=1.0, iterations=1000, seed=0, planar=planar)
+    assert keep is None or keep.all()
+    assert bool(reason) == (keep is None)

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from pipeline.functional.similarity import l2_normalize
@@ -37,10 +38,12 @@ def test_shift_points_towards_the_query():
         assert (shift - true).norm(dim=1).mean() < 0.75 * true.norm()  # without a shift: true.norm()
 
 
-def test_weighted_mean_equals_a_loop_over_the_neighbourhood():
+@pytest.mark.parametrize("subtract_own", [True, False])
+def test_weighted_mean_equals_a_loop_over_the_neighbourhood(subtract_own):
     template, mask, query = _field(), _disc(), _field(0.3, 0.1)
     cell = mask.flatten().nonzero()[::17, 0]
-    found = neighbourhood_shift(query.flatten(0, 1)[cell], template, mask, cell, kernel=3)
+    features = query.flatten(0, 1)[cell]
+    found = neighbourhood_shift(features, template, mask, cell, kernel=3, subtract_own=subtract_own)
     for i, flat in enumerate(cell.tolist()):
         y, x = divmod(flat, _CELLS)
         means = []
@@ -52,7 +55,8 @@ def test_weighted_mean_equals_a_loop_over_the_neighbourhood():
                         weight = max(float(feature @ template[y + oy, x + ox]), 0.0)
                         total, weights = total + weight * torch.tensor([ox, oy]), weights + weight
             means.append(total / weights)
-        assert torch.allclose(found[i], means[0] - means[1], atol=1e-5)  # float32, different order of summation
+        own = means[1] if subtract_own else 0.0
+        assert torch.allclose(found[i], means[0] - own, atol=1e-5)  # float32, different order of summation
 
 
 def test_kernel_1_is_off_and_map_corners_are_supported():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.functional.camera import grid_xy
-from pipeline.functional.epipolar import epipolar_inliers
+from pipeline.functional.epipolar import PlanarMode, epipolar_inliers
 from pipeline.functional.kmeans import kmeans
 from pipeline.functional.masks import foreground
 from pipeline.functional.similarity import l2_normalize, mutual_nearest
@@ -25,12 +26,15 @@ class KMeans(Clusterer):
 
     The foreground cells of each image, scaled to unit length so that distance means cosine, are grouped into ``count``
     clusters; clusters whose centres are mutual nearest neighbours form a pair. ``epipolar`` drops pairs whose mean
-    positions (in cells) lie more than ``threshold_cells`` off the epipolar lines of one fundamental matrix. The check
-    is skipped, and ``note`` says why, where that matrix is undefined: fewer than 8 pairs, or a near-planar set.
+    positions (in cells) lie more than ``threshold_cells`` off the epipolar lines of one fundamental matrix. ``planar``
+    says what happens where a near-planar set does not determine that matrix: the check is skipped, or runs with the
+    matrix that was found (the paper has no such test), or with a homography. ``note`` says why a check was skipped:
+    for a near-planar set, or for fewer than 8 pairs.
     """
 
     kind: ClassVar[str] = "cluster.kmeans"
     version: ClassVar[int] = 1
+    added: ClassVar[Mapping[str, Any]] = {"planar": "skip"}
 
     count: Positive = 200
     iterations: Positive = 20
@@ -38,6 +42,7 @@ class KMeans(Clusterer):
     epipolar: bool = True
     threshold_cells: PositiveFloat = 2.0
     epipolar_iterations: Positive = 1000
+    planar: PlanarMode = "skip"
 
     def encode(self, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]) -> ClusteredMap:
         """k-means clusters of the foreground cells, fewer than ``count`` where there are fewer distinct cells."""
@@ -67,8 +72,9 @@ class KMeans(Clusterer):
         self, query_xy: Float[np.ndarray, "p 2"], template_xy: Float[np.ndarray, "p 2"]
     ) -> tuple[Bool[np.ndarray, " p"] | None, str]:
         return epipolar_inliers(
-            query_xy, template_xy, threshold=self.threshold_cells, iterations=self.epipolar_iterations, seed=self.seed
-        )
+            query_xy, template_xy, threshold=self.threshold_cells, iterations=self.epipolar_iterations, seed=self.seed,
+            planar=self.planar,
+        )  # fmt: skip
 
 
 def _mean_xy(label: Int[Tensor, "h w"]) -> Float[Tensor, "k 2"]:

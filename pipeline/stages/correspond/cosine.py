@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 import torch
 
@@ -22,15 +23,18 @@ class Cosine(Corresponder):
     von Gimborn et al., "Semantic Correspondence Estimation" ("mutual semantic correspondences"; top 10).
     ``per_cluster`` keeps large clusters from outvoting small ones; a single cluster pair keeps all of its matches.
     ``mutual``: keep mutual nearest neighbours only. ``kernel``: side, in cells, of the neighbourhood that gives the
-    template's point its sub-pixel position (functional.subpixel); 1 = off, the cell's centre.
+    template's point its sub-pixel position (functional.subpixel); 1 = off, the cell's centre. ``subtract_own_shift``:
+    subtract the shift that the template cell's own feature gives; False is the equation as printed.
     """
 
     kind: ClassVar[str] = "correspond.cosine"
     version: ClassVar[int] = 1
+    added: ClassVar[Mapping[str, Any]] = {"subtract_own_shift": True}
 
     per_cluster: Positive = 10
     mutual: bool = True
     kernel: Literal[1, 3, 5, 7] = 3
+    subtract_own_shift: bool = True
 
     def __call__(
         self, pair: FusedPair, clusters: Clusters, *, crop_size: int, truth: TrueMatches | None = None
@@ -53,7 +57,10 @@ class Cosine(Corresponder):
         if len(kept) == 0:
             raise NoPose("correspond", f"no cells of {len(clusters.pairs)} cluster pairs have a positive cosine")
         template_kept = template_cell[nearest[kept]]
-        shift = neighbourhood_shift(query[kept], template, pair.template_mask, template_kept, kernel=self.kernel)
+        shift = neighbourhood_shift(
+            query[kept], template, pair.template_mask, template_kept,
+            kernel=self.kernel, subtract_own=self.subtract_own_shift,
+        )  # fmt: skip
         return Correspondences(
             cell_px(query_cell[kept], like=pair.query, crop_size=crop_size),
             cell_px(template_kept, like=pair.template, crop_size=crop_size, shift=shift),
