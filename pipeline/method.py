@@ -56,10 +56,10 @@ class Stages:
     def layers(self) -> tuple[int, ...]:
         """Layers that the route reads: for matching, for fusing, and saliency where a stage needs it."""
         saliency = {SALIENCY_LAYER} if self.correspond.needs_saliency else set()
-        return tuple(sorted({self.match.layer, *self.fuse.layers} | saliency))
+        return tuple(sorted({*self.match.layers, *self.fuse.layers} | saliency))
 
     @property
     def fits(self) -> tuple[Fit, ...]:
-        """What is fitted to an object's templates, each once, after the fits that it is based on."""
+        """The fits of all stages, without repetition; each follows the fits that it is based on."""
         fits = [stage.fit for stage in (self.match, self.fuse) if stage.fit is not None]
         return tuple(dict.fromkeys(part for fit in fits for part in chain(fit)))

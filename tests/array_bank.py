@@ -25,6 +25,9 @@ class ArrayBank:
     def norms(self) -> torch.Tensor:
         return map_norms(self.features)
 
+    def maps(self, layer: int) -> torch.Tensor:
+        return self.features
+
     def view(self, index: int) -> TemplateView:
         return self.views[index]
 

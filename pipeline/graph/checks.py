@@ -30,7 +30,7 @@ OUTSIDE_SHARE = 0.1  # of a box outside the image: often two corners instead of 
 def check_layers(stages: Stages) -> None:
     """Raise BadInput, naming the field that asked for it, for a layer that the extractor does not have."""
     field_of_layer = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
-    field_of_layer[stages.match.layer] = "match.layer"
+    field_of_layer |= dict.fromkeys(stages.match.layers, "match.layers") | {stages.match.layer: "match.layer"}
     for layer in stages.layers:
         try:
             stages.extract.feature_shape(layer)

@@ -97,9 +97,10 @@ def _bank_bytes(stages: Stages, shapes: Mapping[int, Shape], templates: int) -> 
         return sum(fit.array_bytes(shapes[fit.layer][0], templates) for fit in stages.fits)
     if stages.match.needs_truth:
         return 0
-    _, rows, columns = shape = shapes[stages.match.layer]
+    matched = [shapes[layer] for layer in stages.match.layers]
+    cells = max(rows * columns for _, rows, columns in matched)
     mask = stages.crop.size**2
-    return templates * (HALF_BYTES * _values(shape) + mask + MATCHED_CELL_BYTES * rows * columns)
+    return templates * (HALF_BYTES * sum(map(_values, matched)) + mask + MATCHED_CELL_BYTES * cells)
 
 
 def _backbone_needs(context: Context, proposals: ProposalNodes | None) -> tuple[Footprint | None, int, tuple[str, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 
 import numpy as np
 import torch
@@ -39,7 +39,8 @@ Matrix = Float[np.ndarray, "3 3"]
 class StoredBank:
     """One object's templates as input of the online route; views are read one by one, the last few stay in memory."""
 
-    maps: Callable[[], torch.Tensor]
+    layer: int
+    maps: Callable[[int], torch.Tensor]
     masks: Callable[[], torch.Tensor]
     view: Callable[[int], TemplateView]
     draw: Callable[[Pose, Matrix, Matrix], TemplateView]
@@ -48,22 +49,22 @@ class StoredBank:
 
     @cached_property
     def features(self) -> torch.Tensor:
-        """Features of the match layer, float16; the largest array of an object, so read only when a matcher asks."""
-        return self.maps()
+        """Maps of the match layer, float16. They are an object's largest array, so they are read on first use."""
+        return self.maps(self.layer)
 
     @cached_property
     def norms(self) -> torch.Tensor:
-        """Lengths of the flattened maps, float32; computed when a matcher first asks."""
+        """L2 norms of the flattened maps, float32; computed on first use."""
         return map_norms(self.features)
 
     @cached_property
     def mask(self) -> torch.Tensor:
-        """Crop masks of all templates; read when first asked for."""
+        """Crop masks of all templates; read on first use."""
         return self.masks()
 
     @cached_property
     def T_cam_obj(self) -> np.ndarray:
-        """Poses of all templates; read when first asked for."""
+        """Poses of all templates; read on first use."""
         return self.poses()
 
 
@@ -271,8 +272,13 @@ class TemplateNodes:
         def fitted(fit: Fit) -> FittedArrays:
             return self.read_fitted(obj_id, fit, device=self.context.device)
 
+        @cache
+        def maps(layer: int) -> torch.Tensor:
+            return self.context.tensor(features[layer].array("maps"))
+
         return StoredBank(
-            maps=lambda: self.context.tensor(features[self.context.stages.match.layer].array("maps")),
+            layer=self.context.stages.match.layer,
+            maps=maps,
             masks=lambda: self.context.tensor(crops.array("mask")),
             view=view,
             draw=partial(self._render_view, obj_id),

@@ -76,16 +76,20 @@ class TemplateView:
 
 
 class TemplateBank(Protocol):
-    """An object's templates: the match layer, masks and poses of all of them, and any single view in full."""
+    """An object's templates: feature maps, masks and poses of all of them, and any single view in full."""
 
     @property
     def features(self) -> Float[Tensor, "n c h w"]:
-        """Features of the match layer, float16 or float32."""
+        """Feature maps of all templates in the matcher's ``layer``, float16 or float32."""
+        ...
+
+    def maps(self, layer: int) -> Float[Tensor, "n c h w"]:
+        """Feature maps of all templates in one of the matcher's ``layers``, float16 or float32."""
         ...
 
     @property
     def norms(self) -> Float[Tensor, " n"]:
-        """Lengths of the flattened maps of ``features``, float32."""
+        """L2 norms of the flattened maps of ``features``, float32."""
         ...
 
     @property

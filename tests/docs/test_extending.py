@@ -43,3 +43,49 @@ def test_a_worked_example_runs(command, capsys, monkeypatch, folder, tmp_path):
     chosen = [argument.split("=") for argument in arguments if "=" in argument]
     assert all(f"mine.{name}." in record["config"][stage]["_target_"] for stage, name in chosen)
     assert [answer["status"] for answer in record["answers"]] == ["estimate"]
+
+
+TWO_LAYERS = """
+from pipeline.functional.similarity import global_cosine
+from pipeline.spec import spec
+from pipeline.stages.match import Matcher, rank
+
+
+@spec
+class TwoLayers(Matcher):
+    kind = "match.two_layers"
+    version = 1
+    layer: int = 5
+    second: int = 8
+    top_k: int = 2
+
+    @property
+    def layers(self):
+        return self.layer, self.second
+
+    def __call__(self, query, bank):
+        assert bank.maps(self.layer).equal(bank.features)
+        scores = [global_cosine(query.crop.maps[layer], bank.maps(layer)) for layer in self.layers]
+        return rank(sum(scores) / 2, top_k=self.top_k)
+"""
+
+
+@pytest.mark.parametrize(("second", "message"), [(8, ""), (7, "match.layers: found 7, needs one of 2, 5, 8, 11")])
+def test_a_matcher_that_lists_two_layers_gets_both(second, message, capsys, monkeypatch, folder, tmp_path):
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    (folder / "mine" / "two_layers.py").write_text(TWO_LAYERS)
+    (folder / "mine" / "conf" / "match" / "two_layers.yaml").write_text("_target_: mine.two_layers.TwoLayers\n")
+    chosen = (
+        "match=two_layers",
+        f"+match.second={second}",
+        "extract=hog",
+        "fuse.layers=[11]",
+        "store=memory",
+        *TINY,
+        f"out={tmp_path}",
+    )
+    ran = run_dzop(capsys, monkeypatch, "--config-dir", "mine/conf", *chosen)
+    assert message in ran.err
+    assert ran.status == bool(message)
+    assert len(list(tmp_path.glob("*/*/poses.json"))) == (not message)

@@ -19,15 +19,20 @@ from pipeline.spec import Spec
 class Matcher(Spec, ABC):
     """Contract of a match variant.
 
-    ``layer``: the decoder layer that it compares. ``needs_truth``: True for oracles, whose query carries ``truth``.
+    ``layer``: the layer that it compares. ``needs_truth``: True for oracles, whose query carries ``truth``.
     """
 
     layer: int
     needs_truth: ClassVar[bool] = False
 
     @property
+    def layers(self) -> tuple[int, ...]:
+        """All layers that it compares: ``layer``, unless a variant overrides this. ``bank.maps`` reads the others."""
+        return (self.layer,)
+
+    @property
     def fit(self) -> Fit | None:
-        """What is fitted to the templates offline, such as visual words. A matcher with a fit reads
+        """A model fitted to the templates offline, such as visual words. A matcher with a fit reads
         ``bank.fitted(fit)`` instead of ``bank.features``.
         """
         return None
