@@ -12,18 +12,19 @@ from pipeline.bop.dataset import Dataset
 from pipeline.errors import BadInput
 from pipeline.items.views import Target
 from pipeline.metrics.recall import THETAS
-from pipeline.spec import NonNegative, PositiveFloat, spec
+from pipeline.spec import NonNegative, Positive, PositiveFloat, spec
 
 MAX_LISTED = 20  # ids that an error message lists
 
 
 @spec
 class Select:
-    """A subset of the targets by id; None keeps all."""
+    """A subset of the targets by id; None keeps all. ``sample``: at most so many of the images, evenly spaced."""
 
     objects: tuple[int, ...] | None = None
     scenes: tuple[int, ...] | None = None
     images: tuple[int, ...] | None = None
+    sample: Positive | None = None
 
     def targets(self, dataset: Dataset) -> tuple[Target, ...]:
         """The selected targets. Raises BadInput that lists the available ids if none are left."""
@@ -37,7 +38,15 @@ class Select:
             if not selected:
                 listed = ", ".join(map(str, available[:MAX_LISTED])) + (", ..." if len(available) > MAX_LISTED else "")
                 raise BadInput(f"select.{name}", found=list(wanted), needed=f"some of the targets' {name}: {listed}")
-        return selected
+        return selected if self.sample is None else self._sampled(selected, self.sample)
+
+    @staticmethod
+    def _sampled(targets: tuple[Target, ...], count: int) -> tuple[Target, ...]:
+        """The targets of ``count`` evenly spaced images."""
+        images = sorted({(target.scene_id, target.im_id) for target in targets})
+        count = min(count, len(images))
+        chosen = {images[i * len(images) // count] for i in range(count)}
+        return tuple(target for target in targets if (target.scene_id, target.im_id) in chosen)
 
 
 @spec
