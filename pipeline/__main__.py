@@ -1,7 +1,7 @@
 """The command line: Hydra composes the configuration, ``pipeline.run`` runs it.
 
-``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache ...`` manages the store; ``dzop score ...`` and
-``dzop lint ...`` read results files.
+``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache`` manages the store, ``dzop fetch`` downloads
+datasets; ``dzop score`` and ``dzop lint`` read results files.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pipeline.cli.cache import cache_command
+from pipeline.cli.fetch import fetch_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.cli.sweep import FailedJobs, failures_text, record_failed_job
 from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
@@ -49,7 +50,12 @@ from pipeline.io.digests import track_files
 from pipeline.run import make_report, run
 from pipeline.store import Store
 
-COMMANDS = {"cache": cache_command, "score": score_command, "lint": lint_command}
+COMMANDS = {
+    "cache": cache_command,
+    "fetch": fetch_command,
+    "lint": lint_command,
+    "score": score_command,
+}
 RESUME = "Completed entries are cached; rerun to resume."
 READERS = ("__main__.py", "configuration.py")  # our modules whose frames may lie between Hydra's
 NEEDED = {

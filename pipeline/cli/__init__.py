@@ -1,1 +1,1 @@
-"""Commands other than running the pipeline: ``dzop cache``, ``dzop score`` and ``dzop lint``."""
+"""Commands other than running the pipeline: ``dzop cache``, ``fetch``, ``score``, ``lint``."""

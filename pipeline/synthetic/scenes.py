@@ -78,7 +78,7 @@ def _check(root: Path, *, objects: int, images: int, per_image: int, occluded: f
 
 
 def _write_models(root: Path, models: Mapping[int, Mesh], size_hw: tuple[int, int]) -> None:
-    info = {str(obj_id): _extent(mesh) for obj_id, mesh in models.items()}
+    info = {str(obj_id): describe_extent(mesh) for obj_id, mesh in models.items()}
     for folder in (root / "models", root / "models_eval"):
         folder.mkdir()
         _write_json(folder / "models_info.json", info)
@@ -89,7 +89,8 @@ def _write_models(root: Path, models: Mapping[int, Mesh], size_hw: tuple[int, in
     _write_json(root / "camera.json", camera | {"height": size_hw[0], "width": size_hw[1]})
 
 
-def _extent(mesh: Mesh) -> dict[str, float]:
+def describe_extent(mesh: Mesh) -> dict[str, float]:
+    """A mesh's entry in models_info.json without symmetries, mm: diameter, lower corner and size of its box."""
     low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0)
     corner = {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
     return {"diameter": diameter_mm(mesh)} | corner | {f"size_{a}": float(v) for a, v in zip("xyz", size, strict=True)}
@@ -160,13 +161,13 @@ def _write_image(
                 "obj_id": placed.obj_id,
             }
         )
-        infos.append(_gt_info(silhouette, visible, stored > 0))
+        infos.append(describe_instance(silhouette, visible, stored > 0))
     records["scene_camera"][str(im_id)] = {"cam_K": camera.K.reshape(-1).tolist(), "depth_scale": _DEPTH_SCALE}
     records["scene_gt"][str(im_id)] = poses
     records["scene_gt_info"][str(im_id)] = infos
 
 
-def _gt_info(
+def describe_instance(
     silhouette: Bool[np.ndarray, "H W"], visible: Bool[np.ndarray, "H W"], measured: Bool[np.ndarray, "H W"]
 ) -> dict[str, Any]:
     """An instance's entry in scene_gt_info.json, as bop_toolkit defines it."""
