@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo photos pictures train-embedded benchmark-embedded ablations sweeps ladder comparison report bench test test-fast test-faults lint clean
+.PHONY: help setup gl demo photos pictures train-embedded benchmark-embedded ablations sweeps ladder comparison reproduce report bench test test-fast test-faults lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -73,6 +73,9 @@ benchmark-embedded: $(STAMP) ## compare the embedded model with HOG, pixels and 
 
 comparison: $(STAMP) ## compare dzop, zs6d, foundpose and fused features on the same detections; needs weights, see docs/methods.md
 	@( $(call sweep,backbones) ); status=$$?; $(PY) -m pipeline dataset=demo step=report $(ARGS); exit $$status
+
+reproduce: $(STAMP) ## the paper's tables and ablations with Stable Diffusion; ARGS="plan=true" for the cost, ARGS="datasets=[lmo] images=20" for a part
+	$(PY) -m pipeline reproduce $(ARGS)
 
 report: $(STAMP) ## make the report of all runs in results/: results/report/index.html
 	$(PY) -m pipeline step=report $(ARGS)

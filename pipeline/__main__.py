@@ -1,7 +1,7 @@
 """The command line: Hydra composes the configuration, ``pipeline.run`` runs it.
 
 ``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache`` manages the store, ``dzop fetch`` downloads
-datasets; ``dzop score`` and ``dzop lint`` read results files.
+datasets, ``dzop reproduce`` runs what the paper ran; ``dzop score`` and ``dzop lint`` read results files.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pipeline.cli.cache import cache_command
 from pipeline.cli.fetch import fetch_command
+from pipeline.cli.reproduce import reproduce_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.cli.sweep import FailedJobs, failures_text, record_failed_job
 from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
@@ -54,6 +55,7 @@ COMMANDS = {
     "cache": cache_command,
     "fetch": fetch_command,
     "lint": lint_command,
+    "reproduce": reproduce_command,
     "score": score_command,
 }
 RESUME = "Completed entries are cached; rerun to resume."

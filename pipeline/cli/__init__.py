@@ -1,1 +1,1 @@
-"""Commands other than running the pipeline: ``dzop cache``, ``fetch``, ``score``, ``lint``."""
+"""Commands other than running the pipeline: ``dzop cache``, ``fetch``, ``reproduce``, ``score``, ``lint``."""

@@ -21,6 +21,7 @@ from pipeline.io.files import write_atomic, write_error
 from pipeline.report.embedded_pictures import GalleryPicture, PictureEmbedder
 from pipeline.report.plotting import Figure
 from pipeline.report.published_tables import published_methods_of, published_tables
+from pipeline.report.reproduction import reproduction_tables
 from pipeline.report.run_records import RunRecord, unresolved_failures
 from pipeline.report.section import Section, sections_of
 from pipeline.report.table import Table
@@ -103,11 +104,13 @@ def _write_all(
     for part in parts:
         _write_figures(folder / "figures" / part.section.folder, part.figures)
         _write_tables(folder / "tables" / part.section.folder, [*chain.from_iterable(part.tables.values())])
-    _write_tables(folder / "tables", published_tables())
+    reproduced = reproduction_tables(runs)
+    _write_tables(folder / "tables", [*published_tables(), *reproduced])
     text = _template().render(
         parts=parts,
         failed=failed,
         published=published_tables(),
+        reproduced=reproduced,
         runs=sum(run.status == "done" for run in runs) + len(failed),
         skipped_pictures=embedder.skipped,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

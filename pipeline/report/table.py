@@ -12,11 +12,11 @@ NOT_AVAILABLE = "n/a"
 
 @dataclass(frozen=True)
 class Table:
-    """Texts under column headings, all measured or all published. ``name`` is used for files."""
+    """Texts under column headings. ``source`` "both": the headings say which are published. ``name``: of its files."""
 
     name: str
     caption: str
-    source: Literal["measured", "published"]
+    source: Literal["measured", "published", "both"]
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 

@@ -11,7 +11,7 @@ from pipeline.report.table import Table
 from pipeline.report.tables import recall_cells, signed_text
 
 # variation -> whether co-projection, clusters and sub-pixel positions are on
-_PARTS = {"no_coprojection": (0, 1, 0), "no_clusters": (1, 0, 0), "no_subpixel": (1, 1, 0), "none": (1, 1, 1)}
+PARTS = {"no_coprojection": (0, 1, 0), "no_clusters": (1, 0, 0), "no_subpixel": (1, 1, 0), "none": (1, 1, 1)}
 _LADDER = {
     "none": "as estimated",
     "oracle_mask": "true mask",
@@ -23,11 +23,11 @@ _SET_BY_VARIATIONS = {"fuse", "cluster", "detect", "match", "correspond"}
 
 def correspondence_table(runs: Sequence[RunRecord]) -> Table | None:
     """The paper's table "Correspondence estimation" from runs of its variations; None if there are none."""
-    by_name = _by_variation(runs, "no_subpixel")
+    by_name = runs_by_variation(runs, "no_subpixel")
     if not {"no_coprojection", "no_clusters", "no_subpixel"} & set(by_name):
         return None
     rows = []
-    for name, parts in _PARTS.items():
+    for name, parts in PARTS.items():
         if name in by_name:
             run = by_name[name]
             seconds = f"{sum(run.times_s.values()):.2f}"
@@ -39,7 +39,7 @@ def correspondence_table(runs: Sequence[RunRecord]) -> Table | None:
 
 def ladder_table(runs: Sequence[RunRecord]) -> Table | None:
     """The oracle ladder: the gain of each further part replaced by ground truth; None without such runs."""
-    by_name = _by_variation(runs, "oracle_template")
+    by_name = runs_by_variation(runs, "oracle_template")
     shown = [(title, by_name[name]) for name, title in _LADDER.items() if name in by_name]
     if len(shown) < 2 or "oracle_template" not in by_name:
         return None
@@ -57,7 +57,7 @@ def _variation(run: RunRecord) -> str:
     return run.config.get("variation", "none")
 
 
-def _by_variation(runs: Sequence[RunRecord], variation: str) -> dict[str, RunRecord]:
+def runs_by_variation(runs: Sequence[RunRecord], variation: str) -> dict[str, RunRecord]:
     """Runs by variation that agree with the newest run of ``variation`` in every setting that variations leave alone.
 
     "none" is the unvaried run with the fewest other settings.
