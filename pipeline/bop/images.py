@@ -1,14 +1,21 @@
-"""Image files of a BOP dataset as arrays."""
+"""Image files of a BOP dataset as arrays.
+
+Every image of every format (photographs, masks, depth images) is turned upright as its EXIF orientation says.
+"""
 
 from __future__ import annotations
 
 import io
 import struct
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import PIL.Image
+import PIL.ImageFile
+import PIL.ImageOps
+import PIL.PngImagePlugin
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.bop.pixels import DEEP_GREY_VERSION, MAX_MEGAPIXELS, check_megapixels, scale_to_8_bits, select_object
@@ -16,6 +23,8 @@ from pipeline.errors import BadInput
 from pipeline.io.digests import file_digest, unchanged_files
 from pipeline.io.files import IMAGE_FORMATS, read_file
 from pipeline.spec import digest
+
+QUARTER_TURNS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -61,16 +70,9 @@ def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
 PIL.Image.MAX_IMAGE_PIXELS = MAX_MEGAPIXELS * 10**6  # PIL's own limit of 179 would call a large photograph an attack
 warnings.filterwarnings("ignore", category=PIL.Image.DecompressionBombWarning)  # check_megapixels reports it
 _ORIENTATION_TAG = 0x0112
-_UPRIGHT = {
-    2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
-    3: PIL.Image.Transpose.ROTATE_180,
-    4: PIL.Image.Transpose.FLIP_TOP_BOTTOM,
-    5: PIL.Image.Transpose.TRANSPOSE,
-    6: PIL.Image.Transpose.ROTATE_270,
-    7: PIL.Image.Transpose.TRANSVERSE,
-    8: PIL.Image.Transpose.ROTATE_90,
-}
+_EXIF_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")  # keywords of PNG's texts that may state an orientation
 _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
+_BROKEN_EXIF = (*_BROKEN, KeyError, TypeError, struct.error, OverflowError)  # the pixels may be fine
 
 
 def image_digest(path: Path, *, photograph: bool = True) -> str:
@@ -91,7 +93,7 @@ def image_digest(path: Path, *, photograph: bool = True) -> str:
 def _special_rules(image: PIL.Image.Image, *, photograph: bool) -> list[str]:
     """What is done to this image that is not done to a plain one. Raise the number of a rule when it changes."""
     orientation = _read_orientation(image)
-    rules = [] if orientation not in _UPRIGHT else [f"EXIF orientation {orientation}"]
+    rules = [] if orientation == 1 else [f"EXIF orientation {orientation}"]
     is_deep_grey = photograph and image.mode[0] in "IF"
     return [*rules, f"more than 8 bits, rule {DEEP_GREY_VERSION}"] if is_deep_grey else rules
 
@@ -100,8 +102,8 @@ def image_size(path: Path) -> tuple[int, int]:
     """(h, w) of the upright image, from the file's header; the pixels are not read."""
     try:
         with unchanged_files([path]), _open_header(path) as image:
-            rotated_by_90 = _read_orientation(image) in (5, 6, 7, 8)
-            return (image.width, image.height) if rotated_by_90 else (image.height, image.width)
+            turned = image.format != "TIFF" and _read_orientation(image) in QUARTER_TURNS  # PIL turns TIFF itself
+            return (image.width, image.height) if turned else (image.height, image.width)
     except _BROKEN as error:
         raise _unreadable_image(path, error) from None
 
@@ -135,22 +137,38 @@ def _open(path: Path) -> PIL.Image.Image:
         image.load()  # PIL notices a truncated file only when it reads the pixels
     except _BROKEN as error:
         raise _unreadable_image(path, error) from None
-    operation = _UPRIGHT.get(_read_orientation(image))
-    return image if operation is None else image.transpose(operation)
+    with suppress(*_BROKEN_EXIF):
+        PIL.ImageOps.exif_transpose(image, in_place=True)
+    return image
 
 
 def _read_orientation(image: PIL.Image.Image) -> int:
-    """EXIF orientation (1 to 8), 1 without one; cv2.imread applies it too.
-
-    Ignored for PNG, where PIL would have to read all pixels first, and for TIFF, which PIL rotates itself.
-    """
-    if image.format not in ("JPEG", "MPO", "WEBP"):
+    """EXIF orientation (1 to 8) that PIL applies to an opened image; 1 without one and for any other value."""
+    if isinstance(image, PIL.PngImagePlugin.PngImageFile) and not _has_exif(image):
         return 1
-    try:
+    with suppress(*_BROKEN_EXIF):
         found = image.getexif().get(_ORIENTATION_TAG, 1)
-    except (*_BROKEN, KeyError, TypeError, struct.error, OverflowError):  # broken EXIF; the pixels may be fine
-        return 1
-    return found if isinstance(found, int) else 1
+        return int(found) if found in range(2, 9) else 1
+    return 1
+
+
+def _has_exif(image: PIL.ImageFile.ImageFile) -> bool:
+    """Whether a PNG, of which only the header was read, has EXIF anywhere: PIL would decode all pixels to find out."""
+    stream = image.fp
+    if stream is None:
+        return "exif" in image.info
+    start = stream.tell()
+    try:
+        stream.seek(8)
+        while len(head := stream.read(8)) == 8:
+            length, name = struct.unpack(">I4s", head)
+            text = stream.read(min(length, 32)) if name in (b"tEXt", b"zTXt", b"iTXt") else b""
+            if name == b"eXIf" or text.startswith(_EXIF_TEXTS):
+                return True
+            stream.seek(length + 4 - len(text), io.SEEK_CUR)
+        return False
+    finally:
+        stream.seek(start)
 
 
 def _unreadable_image(path: Path, error: Exception) -> BadInput:

@@ -2,7 +2,6 @@ import json
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import yaml
@@ -10,7 +9,6 @@ from PIL import Image
 from tiny_bop import HALF_MM, POSES, SIZE_HW, K, edit_json, rectangle, write_box_ply, write_json, write_tiny_bop
 
 from pipeline.bop.dataset import Dataset, DatasetConfig, open_dataset
-from pipeline.bop.images import image_size, read_mask, read_rgb
 from pipeline.bop.scene import check_K
 from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
@@ -97,32 +95,6 @@ def test_grey_images_have_three_equal_channels_and_8_bits(root: Path, scene: Pat
         assert np.abs(rgb[..., 0] - ramp / 257).max() <= 1  # rounding of 16 to 8 bit
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "WEBP", "TIFF"])
-@pytest.mark.parametrize("orientation", [None, *range(1, 9), 77])
-def test_images_are_rotated_upright_as_in_opencv(tmp_path: Path, kind: str, orientation: int | None):
-    rgb = np.zeros((40, 64, 3), np.uint8)
-    rgb[:20, :32], rgb[:20, 32:], rgb[20:, :32] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
-    exif = Image.Exif()
-    if orientation:
-        exif[0x0112] = orientation
-    path = tmp_path / f"photo.{kind.lower()}"
-    Image.fromarray(rgb).save(path, kind, exif=exif, **({} if kind == "TIFF" else {"quality": 95}))
-    read = read_rgb(path)
-    assert image_size(path) == read.shape[:2]
-    if kind == "JPEG":  # OpenCV ignores the orientation of other formats or cannot read them
-        seen = cv2.imread(str(path))[..., ::-1]
-        assert read.shape == seen.shape
-        assert np.abs(read.astype(int) - seen).mean() < 3
-    turned = orientation in (5, 6, 7, 8)
-    assert read.shape[:2] == ((64, 40) if turned else (40, 64))
-    red = {None: (0, 0), 1: (0, 0), 77: (0, 0), 2: (0, -1), 3: (-1, -1), 4: (-1, 0), 5: (0, 0), 6: (0, -1), 7: (-1, -1)}
-    y, x = red.get(orientation, (-1, 0))
-    assert read[8 if y == 0 else -9, 8 if x == 0 else -9].argmax() == 0
-    white = np.full((40, 64, 3), 255, np.uint8)
-    Image.fromarray(white).save(path, kind, exif=exif, **({} if kind == "TIFF" else {"quality": 95}))
-    assert read_mask(path).shape == read_rgb(path).shape[:2]
-
-
 def test_without_a_targets_file_every_annotated_instance_is_a_target(root: Path):
     asked = open_tiny(root).targets
     (root / "test_targets_bop19.json").unlink()
@@ -150,22 +122,6 @@ def test_models_folder_is_chosen_by_argument(root: Path):
     assert str(root / "models") in text
     assert "models_cad" in text
     assert open_tiny(root, models="models_cad").object_model(1).obj_id == 1
-
-
-@pytest.mark.parametrize(
-    ("stated", "read"),
-    [
-        ({}, ()),
-        ({"dist_coeffs": [0, 0, 0, 0, 0]}, ()),
-        ({"dist_coeffs": [0.1, -0.2, 0, 0, 0.05]}, (0.1, -0.2, 0.05)),
-        ({"cam_dist": [-0.3, 0.09]}, (-0.3, 0.09)),
-        ({"distortion": [0.01]}, (0.01,)),
-    ],
-)
-def test_distortion_coefficients_that_are_not_zero_are_read(tmp_path, stated, read):
-    root = write_tiny_bop(tmp_path / "tiny")
-    edit_json(root / "test" / "000007" / "scene_camera.json", lambda cameras: cameras["0"].update(stated))
-    assert open_dataset(root, name="tiny").distortion(7, 0) == read
 
 
 def test_camera_of_a_crop_is_accepted():
