@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.bop.images import image_size, read_depth, read_mask, read_rgb
+from pipeline.bop.images import image_digest, image_size, read_depth, read_mask, read_rgb
 from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
-from pipeline.bop.layout import check_folders, check_scene_folder, find_model
+from pipeline.bop.layout import check_folders, check_scene_folder, check_sensor_name, find_model
+from pipeline.bop.lens import describe_distortion
 from pipeline.bop.models import ModelInfo, check_model_files, read_model, read_models_info
 from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
 from pipeline.errors import BadInput
@@ -34,18 +37,24 @@ BOP_WIDTH_PX = {"lm": 640, "lmo": 640, "ycbv": 640, "tless": 720, "tudl": 640, "
 
 @spec
 class DatasetConfig:
-    """Which dataset, and where. ``root`` is only a location: keys depend on the contents of files, not on it."""
+    """Which dataset, and where. ``root`` is only a location: keys depend on the contents of files, not on it.
+
+    ``sensor``: the sensor whose files are read, in datasets whose scenes have files of several.
+    """
 
     name: str
     root: str
     split: str = "test"
     models: str = "models"
     targets: str | None = "test_targets_bop19.json"
+    sensor: str | None = None
 
     def open(self) -> Dataset:
         """The dataset, checked. Raises BadInput."""
-        root = Path(self.root).expanduser()
-        return open_dataset(root, name=self.name, split=self.split, models=self.models, targets=self.targets)
+        root, sensor = Path(self.root).expanduser(), self.sensor
+        return open_dataset(
+            root, name=self.name, split=self.split, models=self.models, targets=self.targets, sensor=sensor
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +73,7 @@ class Dataset:
     models_info: dict[int, ModelInfo]
     targets: tuple[Target, ...] = ()
     warnings: tuple[str, ...] = ()
+    sensor: str = ""
     _scenes: dict[int, Scene] = field(default_factory=dict, repr=False)
 
     @property
@@ -87,16 +97,26 @@ class Dataset:
         return None
 
     @property
-    def given_mask_label(self) -> int | None:
-        """The object's value in a mask that labels several; it is part of the keys of detections."""
-        return None
+    def given_location(self) -> list[Any]:
+        """What else the config says about where objects are; it is part of the keys of detections."""
+        return []
+
+    @property
+    def requires_pose(self) -> bool:
+        """Whether a run without a single pose has failed, rather than measured that there is none."""
+        return False
+
+    @property
+    def image_note(self) -> str:
+        """What was done to the images beyond reading them; pictures say it."""
+        return ""
 
     def scene(self, scene_id: int) -> Scene:
         """The scene; its JSON files are read once."""
         if scene_id not in self._scenes:
             folder = self.root / self.split / f"{scene_id:06d}"
-            check_scene_folder(folder, scene_id)
-            self._scenes[scene_id] = Scene(folder, scene_id)
+            check_scene_folder(folder, scene_id, self.sensor)
+            self._scenes[scene_id] = Scene(folder, scene_id, self.sensor)
         return self._scenes[scene_id]
 
     def image(self, scene_id: int, im_id: int) -> Image:
@@ -109,6 +129,10 @@ class Dataset:
     def image_path(self, scene_id: int, im_id: int) -> Path:
         """The image's file."""
         return self.scene(scene_id).image_path(im_id)
+
+    def image_digest(self, scene_id: int, im_id: int) -> str:
+        """Digest of the image as ``image`` returns it."""
+        return image_digest(self.image_path(scene_id, im_id))
 
     def image_size(self, scene_id: int, im_id: int) -> tuple[int, int]:
         """(h, w) of the image, from its header."""
@@ -124,8 +148,8 @@ class Dataset:
                 return image_size(find_file(scene_id, im_id))[1]
             except BadInput:
                 continue
-        for path in sorted(self.root.glob("camera*.json")):
-            width = read_json(path).get("width")
+        for record in self._root_cameras():
+            width = record.get("width")
             if isinstance(width, int) and width > 0:
                 return width
         if self.name in BOP_WIDTH_PX:
@@ -137,9 +161,24 @@ class Dataset:
         """The image's camera matrix, px."""
         return self.scene(scene_id).camera(im_id).K
 
-    def distortion(self, scene_id: int, im_id: int) -> tuple[float, ...]:
-        """Lens coefficients that the camera's record states and that nothing here applies; () without any."""
-        return self.scene(scene_id).camera(im_id).distortion
+    def distortion(self, scene_id: int, im_id: int) -> str:
+        """What the camera's record, or else camera*.json, says of distortion that is not applied; "" for none."""
+        return self.scene(scene_id).camera(im_id).distortion or self._root_distortion
+
+    def _root_cameras(self) -> list[dict[str, Any]]:
+        """Contents of the files camera*.json, or of the sensor's, which describe the cameras as a whole."""
+        own = self.root / f"camera_{self.sensor}.json"
+        paths = [own] if self.sensor and file_exists(own) else sorted(self.root.glob("camera*.json"))
+        contents = [read_json(path) for path in paths]
+        return [content for content in contents if isinstance(content, dict)]
+
+    @cached_property
+    def _root_distortion(self) -> str:
+        """What the only file camera*.json says of distortion; several are of several sensors."""
+        with suppress(BadInput):  # the file is not needed otherwise
+            records = self._root_cameras()
+            return describe_distortion(records[0]) if len(records) == 1 else ""
+        return ""
 
     def depth_path(self, scene_id: int, im_id: int) -> Path:
         """The depth image's file."""
@@ -149,13 +188,13 @@ class Dataset:
         """Measured depth along the optical axis, mm; 0 where unknown."""
         scale = self.scene(scene_id).camera(im_id).depth_scale
         if scale is None:
-            where = describe_place(self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id)
+            where = describe_place(self.scene(scene_id).path("scene_camera.json"), scene=scene_id, image=im_id)
             raise BadInput(f"{where}, field depth_scale", found="nothing", needed="mm per unit of the depth image")
         return read_depth(self.depth_path(scene_id, im_id), scale)
 
     def has_ground_truth(self, scene_id: int) -> bool:
         """Whether the scene is annotated."""
-        return file_exists(self.scene(scene_id).folder / "scene_gt.json")
+        return file_exists(self.scene(scene_id).path("scene_gt.json"))
 
     def ground_truth(self, scene_id: int, im_id: int) -> list[GroundTruth]:
         """Annotated instances in the order of scene_gt.json (index = gt_id), rotations as published."""
@@ -191,7 +230,7 @@ class Dataset:
     def where_camera(self, scene_id: int, im_id: int) -> str:
         """Location of an image's K in its file, for error messages."""
         return describe_place(
-            self.scene(scene_id).folder / "scene_camera.json", scene=scene_id, image=im_id, field="cam_K"
+            self.scene(scene_id).path("scene_camera.json"), scene=scene_id, image=im_id, field="cam_K"
         )
 
 
@@ -202,16 +241,19 @@ def open_dataset(
     split: str = "test",
     models: str = "models",
     targets: str | None = "test_targets_bop19.json",
+    sensor: str | None = None,
     photographs: bool = True,
 ) -> Dataset:
     """The dataset at ``root``, after checking that every target has an image, a camera and a model.
 
     ``photographs`` False: do not check images, which scoring does not need. ``models``: folder of the meshes (T-LESS:
     models_cad or models_reconst). ``targets``: file of the targets; with None or a missing file, every annotated
-    instance of every image is a target. Reads only JSON files and image headers. Raises BadInput at the first error.
+    instance of every image is a target. ``sensor``: see DatasetConfig. Reads only JSON files and image headers. Raises
+    BadInput at the first error.
     """
     check_folders(root, split, models)
-    dataset = Dataset(name, root, split, models, read_models_info(root / models / "models_info.json"))
+    infos = read_models_info(root / models / "models_info.json")
+    dataset = Dataset(name, root, split, models, infos, sensor=check_sensor_name(sensor))
     path = None if targets is None else root / targets
     records = None if path is None or not file_exists(path) else read_json(path)
     if path is not None and isinstance(records, list) and _are_images(records):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,6 +14,7 @@ from pipeline.io.meshes import SUFFIXES
 
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar", ".z01")
 _MAX_LISTED = 12
+_SENSOR = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 def check_folders(root: Path, split: str, models: str) -> None:
@@ -38,24 +40,27 @@ def check_folders(root: Path, split: str, models: str) -> None:
             raise BadInput(folder, found=f"a folder within: {deeper[0].name}", needed=f"{what}, not one level deeper")
 
 
-def check_scene_folder(folder: Path, scene_id: int) -> None:
-    """Raise BadInput for a missing scene, and for a scene whose files carry the names of sensors."""
+def check_scene_folder(folder: Path, scene_id: int, sensor: str = "") -> None:
+    """Raise BadInput for a missing scene, and for one without files of the chosen sensor; lists the sensors there."""
     where = describe_place(folder, scene=scene_id)
     if not folder.is_dir():
         there = [p.name for p in _list_folders(folder.parent)] + _list_archives(folder.parent)
         raise BadInput(where, found=f"no such folder{_hint(there)}", needed="the scene's folder")
-    if file_exists(folder / "scene_camera.json"):
-        return
+    name = f"scene_camera_{sensor}.json" if sensor else "scene_camera.json"
     sensors = sorted(p.stem.removeprefix("scene_camera_") for p in folder.glob("scene_camera_*.json"))
-    if sensors:
-        name = sensors[0]
-        found = (
-            f"files of sensors {', '.join(sensors[:_MAX_LISTED])} (scene_camera_{name}.json) and no scene_camera.json"
-        )
-        needed = (
-            f"a copy or links without the suffix, such as scene_camera.json, rgb, for one sensor (here from {name})"
-        )
-        raise BadInput(where, found=found, needed=needed)
+    if file_exists(folder / name) or not (sensor or sensors):
+        return
+    if not sensors:
+        raise BadInput(where, found=f"no {name}, and no other sensor's", needed="dataset.sensor=null")
+    found = f"files of the sensors {', '.join(sensors[:_MAX_LISTED])} and no {name}"
+    raise BadInput(where, found=found, needed=f"dataset.sensor, one of them, such as dataset.sensor={sensors[0]}")
+
+
+def check_sensor_name(sensor: str | None) -> str:
+    """The sensor's name, "" for None. Raises BadInput for one that is not part of a file name."""
+    if sensor is not None and not _SENSOR.fullmatch(sensor):
+        raise BadInput("dataset.sensor", found=repr(sensor), needed="a sensor's name, such as cam1 or photoneo")
+    return sensor or ""
 
 
 def find_model(folder: Path, obj_id: int) -> Path:

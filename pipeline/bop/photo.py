@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.images import image_size, read_rgb
+from pipeline.bop.images import QUARTER_TURNS, image_digest, image_size, read_mask, read_orientation, read_rgb
 from pipeline.bop.jsonio import is_number
+from pipeline.bop.lens import Lens, parse_lens
 from pipeline.bop.scene import Box, check_K, xyxy_from_xywh
 from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import denormalize_camera
@@ -32,6 +33,8 @@ class PhotoConfig(Spec):
     ``mesh``: one file, or several for a detector; they become objects 1, 2, ... in this order. ``K``: fx, fy, cx, cy
     or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height in pixels. ``mask_label``: the
     object's value in a mask that labels several. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres.
+    ``distortion``: k1, k2, p1, p2[, k3[, k4, k5, k6]] of OpenCV's model; the photograph, the mask and the box are
+    undistorted before anything else.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -43,6 +46,7 @@ class PhotoConfig(Spec):
     mask_label: Positive | None = None
     bbox: tuple[float, ...] | None = None
     scale: PositiveFloat = 1.0
+    distortion: tuple[Any, ...] | str | None = None
     name: str = "photo"
 
     def open(self) -> Photo:
@@ -79,6 +83,7 @@ class PhotoConfig(Spec):
             mask_file=None if self.mask is None else Path(self.mask).expanduser(),
             bbox_xyxy=None if self.bbox is None else xyxy_from_xywh(self.bbox),
             scale=self.scale,
+            lens=None if self.distortion is None else parse_lens(self.distortion, K, size_hw),
         )
 
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -128,6 +133,7 @@ class Photo(Dataset):
     mask_label: int | None = None
     bbox_xyxy: Box | None = None
     scale: float = 1.0
+    lens: Lens | None = None
 
     @property
     def location_field(self) -> str:
@@ -140,13 +146,40 @@ class Photo(Dataset):
         return self.bbox_xyxy
 
     @property
-    def given_mask_label(self) -> int | None:
-        """The label, if one is given."""
-        return self.mask_label
+    def given_location(self) -> list[Any]:
+        """Label of the mask and lens, where they are given."""
+        given = [] if self.mask_label is None else [self.mask_label]
+        return given if self.lens is None else [*given, self.lens.identity()]
+
+    @property
+    def requires_pose(self) -> bool:
+        """True: who gives a photograph wants its pose."""
+        return True
+
+    @property
+    def image_note(self) -> str:
+        """That pictures show the photograph without distortion."""
+        return "" if self.lens is None else "undistorted photograph"
 
     def image(self, scene_id: int, im_id: int) -> Image:
-        """The photograph."""
-        return Image(scene_id, im_id, read_rgb(self.photo_path), self.camera_matrix)
+        """The photograph, without the lens's distortion if that is given."""
+        rgb = read_rgb(self.photo_path)
+        return Image(scene_id, im_id, rgb if self.lens is None else self.lens.undistort(rgb), self.camera_matrix)
+
+    def image_digest(self, scene_id: int, im_id: int) -> str:
+        """Digest of the photograph as ``image`` returns it."""
+        content = image_digest(self.photo_path)
+        return content if self.lens is None else digest([content, self.lens.identity()])
+
+    def object_mask(self, path: Path, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+        """The mask in a file, without the lens's distortion if that is given. Raises BadInput for another size."""
+        mask, (h, w) = read_mask(path, label=self.mask_label), size_hw
+        if mask.shape != size_hw:
+            turned = mask.shape == (w, h) and read_orientation(self.photo_path) in QUARTER_TURNS
+            found = f"{mask.shape[1]} x {mask.shape[0]} pixels"
+            cause = "; EXIF turns the photograph upright, and not the mask" if turned else ""
+            raise BadInput(path, found=found, needed=f"those of the photograph, {w} x {h} (width x height){cause}")
+        return mask if self.lens is None else self.lens.undistort(mask)
 
     def image_path(self, scene_id: int, im_id: int) -> Path:
         """The photograph's file."""
@@ -156,9 +189,9 @@ class Photo(Dataset):
         """The photograph's camera matrix, px."""
         return self.camera_matrix
 
-    def distortion(self, scene_id: int, im_id: int) -> tuple[float, ...]:
-        """(): a photograph is given with K alone."""
-        return ()
+    def distortion(self, scene_id: int, im_id: int) -> str:
+        """Nothing: coefficients that are given are applied."""
+        return ""
 
     def has_ground_truth(self, scene_id: int) -> bool:
         """False: a photograph has no ground truth."""

@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.bop.jsonio import abbreviate, describe_place, get_field, get_integer, get_numbers, is_number, read_by_id
+from pipeline.bop.lens import describe_distortion
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.io.digests import file_exists
 
 # Largest entry of |R R^T - I|. LM-O's published rotations reach 1e-2; rounding to three decimals gives 2e-3.
 ROTATION_TOLERANCE = 2e-2
-_IMAGE_FILES = ("rgb/{:06d}.png", "rgb/{:06d}.jpg", "gray/{:06d}.png", "gray/{:06d}.tif", "gray/{:06d}.jpg")
-_DEPTH_FILES = ("depth/{:06d}.png", "depth/{:06d}.tif")
+_IMAGE_FILES = (("rgb", ".png"), ("rgb", ".jpg"), ("gray", ".png"), ("gray", ".tif"), ("gray", ".jpg"))
+_DEPTH_FILES = (("depth", ".png"), ("depth", ".tif"))
 
 Box = tuple[float, float, float, float]
 
@@ -28,12 +29,12 @@ Box = tuple[float, float, float, float]
 class Camera:
     """An image's camera matrix, px. ``depth_scale``: mm per unit of the depth image, None if unknown.
 
-    ``distortion``: lens coefficients stated beside K that are not 0; images are taken as undistorted.
+    ``distortion``: what is stated of it beside K, "" for nothing; images are taken as undistorted.
     """
 
     K: Float[np.ndarray, "3 3"]
     depth_scale: float | None
-    distortion: tuple[float, ...] = ()
+    distortion: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,25 +55,34 @@ class GroundTruth:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A folder ``<root>/<split>/<scene_id>``. Its JSON files are read once, when first needed."""
+    """A folder ``<root>/<split>/<scene_id>``. Its JSON files are read once, when first needed.
+
+    ``sensor``: in a scene that several sensors saw, the one whose files are read: scene_camera_cam1.json, rgb_cam1/.
+    """
 
     folder: Path
     scene_id: int
+    sensor: str = ""
+
+    def path(self, name: str) -> Path:
+        """A file or folder by its name in BOP's format, such as scene_gt.json or mask; that of the sensor."""
+        stem, dot, suffix = name.partition(".")
+        return self.folder / (f"{stem}_{self.sensor}{dot}{suffix}" if self.sensor else name)
 
     @cached_property
     def cameras(self) -> dict[int, Any]:
         """scene_camera.json by image, not validated."""
-        return read_by_id(self.folder / "scene_camera.json")
+        return read_by_id(self.path("scene_camera.json"))
 
     @cached_property
     def annotations(self) -> dict[int, Any]:
         """scene_gt.json by image, not validated."""
-        return read_by_id(self.folder / "scene_gt.json")
+        return read_by_id(self.path("scene_gt.json"))
 
     @cached_property
     def annotation_infos(self) -> dict[int, Any]:
         """scene_gt_info.json by image, not validated; empty without the file."""
-        path = self.folder / "scene_gt_info.json"
+        path = self.path("scene_gt_info.json")
         return read_by_id(path) if file_exists(path) else {}
 
     def image_path(self, im_id: int) -> Path:
@@ -85,11 +95,11 @@ class Scene:
 
     def mask_path(self, im_id: int, gt_id: int, *, visible: bool) -> Path:
         """File of an instance's mask, visible part or full silhouette. The file may be missing."""
-        return self.folder / ("mask_visib" if visible else "mask") / f"{im_id:06d}_{gt_id:06d}.png"
+        return self.path("mask_visib" if visible else "mask") / f"{im_id:06d}_{gt_id:06d}.png"
 
     def camera(self, im_id: int) -> Camera:
         """K and depth scale of one image. Raises BadInput."""
-        path = self.folder / "scene_camera.json"
+        path = self.path("scene_camera.json")
         where = describe_place(path, scene=self.scene_id, image=im_id)
         if im_id not in self.cameras:
             raise BadInput(where, found="no entry", needed="cam_K of this image")
@@ -101,7 +111,7 @@ class Scene:
             found = f"cam_model {abbreviate(record['cam_model'])} and no cam_K"
             raise BadInput(where, found=found, needed="cam_K of a pinhole camera: undistort the images first")
         K = get_numbers(record, "cam_K", 9, where).reshape(3, 3)
-        return Camera(K, None if scale is None else float(scale), _read_distortion(record))
+        return Camera(K, None if scale is None else float(scale), describe_distortion(record))
 
     def ground_truth(self, im_id: int) -> list[GroundTruth]:
         """Annotated instances of one image. Raises BadInput for a missing annotation or an impossible pose."""
@@ -115,7 +125,7 @@ class Scene:
         return {}
 
     def _parse_ground_truth(self, im_id: int) -> list[GroundTruth]:
-        path = self.folder / "scene_gt.json"
+        path = self.path("scene_gt.json")
         where = describe_place(path, scene=self.scene_id, image=im_id)
         records = self.annotations.get(im_id)
         if not isinstance(records, list):
@@ -131,26 +141,20 @@ class Scene:
             return [None] * count
         infos = self.annotation_infos.get(im_id)
         if not isinstance(infos, list) or len(infos) != count:
-            where = describe_place(self.folder / "scene_gt_info.json", scene=self.scene_id, image=im_id)
+            where = describe_place(self.path("scene_gt_info.json"), scene=self.scene_id, image=im_id)
             found = f"{len(infos)} entries" if isinstance(infos, list) else abbreviate(infos)
             found = "no entry" if infos is None else found
             raise BadInput(where, found=found, needed=f"{count} entries, as many as scene_gt.json has")
         return infos
 
-    def _find_file(self, patterns: tuple[str, ...], im_id: int, what: str) -> Path:
-        candidates = [self.folder / pattern.format(im_id) for pattern in patterns]
+    def _find_file(self, places: tuple[tuple[str, str], ...], im_id: int, what: str) -> Path:
+        candidates = [self.path(folder) / f"{im_id:06d}{suffix}" for folder, suffix in places]
         for path in candidates:
             if file_exists(path):
                 return path
         where = describe_place(self.folder, scene=self.scene_id, image=im_id)
-        names = ", ".join(pattern.format(im_id) for pattern in patterns)
+        names = ", ".join(path.relative_to(self.folder).as_posix() for path in candidates)
         raise BadInput(where, found="no file", needed=f"{what} at one of {names}")
-
-
-def _read_distortion(record: dict[str, Any]) -> tuple[float, ...]:
-    """Lens distortion coefficients of a camera's record that are not 0, whatever the field is called."""
-    values = [value for name, value in record.items() if "dist" in name.lower() and isinstance(value, list)]
-    return tuple(float(v) for v in values[0] if is_number(v) and v != 0) if values else ()
 
 
 def xyxy_from_xywh(bbox_xywh: Sequence[float]) -> Box:
@@ -200,7 +204,7 @@ def _parse_instance(record: Any, info: Any, gt_id: int, where: str) -> GroundTru
     pose = get_integer(record, "obj_id", where), rigid(R, t)
     if info is None:
         return GroundTruth(gt_id, *pose)
-    where = where.replace("scene_gt.json", "scene_gt_info.json")
+    where = where.replace("/scene_gt", "/scene_gt_info")
     visible = get_field(info, "visib_fract", where)
     if not (is_number(visible) and 0 <= visible <= 1):
         raise BadInput(f"{where}, field visib_fract", found=abbreviate(visible), needed="a number from 0 to 1")

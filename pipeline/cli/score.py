@@ -103,6 +103,7 @@ def _add_dataset_options(parser: argparse.ArgumentParser, *, required: bool) -> 
     parser.add_argument("--dataset", required=required, metavar="ROOT", help="folder of a dataset in BOP format")
     parser.add_argument("--split", help="its folder of scenes (default: taken from the csv's name)")
     parser.add_argument("--targets", default=TARGETS, help=f"its targets file (default: {TARGETS})")
+    parser.add_argument("--sensor", help="the sensor to read, in scenes with files of several (scene_gt_cam1.json)")
     parser.add_argument("--models", help="its folder of meshes (default: models_eval if there is one, else models)")
 
 
@@ -129,7 +130,15 @@ def _open_dataset(options: argparse.Namespace, path: Path) -> Dataset:
     if not (root / options.targets).exists() and options.targets != TARGETS:
         raise BadInput(root / options.targets, found="no such file", needed="the targets file that --targets names")
     name = parts[1] if parts else root.resolve().name
-    return open_dataset(root, name=name, split=split, models=models, targets=options.targets, photographs=False)
+    return open_dataset(
+        root,
+        name=name,
+        split=split,
+        models=models,
+        targets=options.targets,
+        sensor=options.sensor,
+        photographs=False,
+    )
 
 
 def _find_split(root: Path, split: str) -> str:

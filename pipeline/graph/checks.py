@@ -56,9 +56,7 @@ def detection_warnings(context: Context, detections: Sequence[Detection], *, cac
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
             warnings.append(f"scene {scene_id}, image {im_id}: {problem}")
-        if coefficients := context.dataset.distortion(scene_id, im_id):
-            shown = ", ".join(f"{value:g}" for value in coefficients[:4])
-            reason = f"distortion coefficients ({shown}) are not applied; undistort the images for exact poses"
+        if reason := context.dataset.distortion(scene_id, im_id):
             warnings.append(f"scene {scene_id}, image {im_id}: {reason}")
     for d in detections:
         if d.defect is None and (problem := _check_detection(context, d)):

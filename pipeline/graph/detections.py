@@ -35,9 +35,7 @@ class DetectionNodes:
         targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.context.targets]
         asked: list[Any] = [targets, None]
         if not self.proposals:
-            data = self.context.dataset
-            label = [] if data.given_mask_label is None else [data.given_mask_label]
-            asked = [targets, data.given_bbox_xyxy, *label]
+            asked = [targets, self.context.dataset.given_bbox_xyxy, *self.context.dataset.given_location]
         return make_ref("detections", recipe, self._sources() | {"targets": digest(asked)})
 
     def _sources(self) -> dict[str, str]:

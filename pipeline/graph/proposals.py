@@ -10,7 +10,6 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 
-from pipeline.bop.images import image_digest
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.descriptors import pool_foreground
@@ -91,7 +90,7 @@ class ProposalNodes:
         """Proposals of an image."""
         if image not in self._proposal_refs:
             recipe = {"kind": "proposals", "proposals": self.describer.proposer.recipe()}
-            inputs = {"image": image_digest(self.context.dataset.image_path(*image))}
+            inputs = {"image": self.context.dataset.image_digest(*image)}
             self._proposal_refs[image] = make_ref("proposals", recipe, inputs)
         return self._proposal_refs[image]
 

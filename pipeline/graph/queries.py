@@ -9,7 +9,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from pipeline.bop.images import image_digest
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
@@ -71,7 +70,7 @@ class QueryNodes:
     def _crops(self, image: ImageId) -> Ref:
         shown = [[d.obj_id, list(d.bbox_xyxy), d.rle] for _, d in self.of_image[image]]
         recipe = {"kind": "query crops", "crop": self.context.stages.crop.recipe()}
-        inputs = {"image": image_digest(self.context.dataset.image_path(*image)), "detections": digest(shown)}
+        inputs = {"image": self.context.dataset.image_digest(*image), "detections": digest(shown)}
         if self.context.stages.crop.needs_camera:
             inputs["camera"] = digest(self.context.K(image).tolist())
         return make_ref("crops", recipe, inputs)

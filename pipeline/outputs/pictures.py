@@ -59,7 +59,8 @@ class Pictures:
             for image, indices in sorted(by_image.items()):
                 path = self.folder.overlays / f"{image[0]:06d}_{image[1]:06d}.jpg"
                 if not shows(path, self.made_from):
-                    picture = draw_overlay(context.dataset.image(*image), self._poses_to_draw(indices))
+                    photo, note = context.dataset.image(*image), context.dataset.image_note
+                    picture = draw_overlay(photo, self._poses_to_draw(indices), note=note)
                     write_overlay(path, picture, made_from=self.made_from)
                     drawn += 1
                 advance(1)

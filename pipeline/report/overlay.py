@@ -37,11 +37,14 @@ class DrawnPose:
     label: str = ""
 
 
-def draw_overlay(image: Image, items: Sequence[DrawnPose], *, legend: bool = True) -> UInt8[np.ndarray, "H W 3"]:
+def draw_overlay(
+    image: Image, items: Sequence[DrawnPose], *, legend: bool = True, note: str = ""
+) -> UInt8[np.ndarray, "H W 3"]:
     """The photograph with the silhouette outline, 3D box and label of every pose, estimates above ground truth.
 
     Images smaller than 1000 px are enlarged by an integer factor of at most 4. The box is the mesh's bounding box,
-    aligned with the axes of the object frame. Parts behind the camera are left out.
+    aligned with the axes of the object frame. Parts behind the camera are left out. ``note``: what was done to the
+    photograph, at the lower right.
     """
     factor = _enlargement_factor(image.rgb)
     h, w = (side * factor for side in image.rgb.shape[:2])
@@ -58,7 +61,7 @@ def draw_overlay(image: Image, items: Sequence[DrawnPose], *, legend: bool = Tru
         thickness = width + 1 if item.role == "truth" else width
         _draw_lines(canvas, _outlines(item, K, (h, w)), ROLE_COLOURS[item.role], thickness)
     roles = [role for role in ROLE_COLOURS if any(item.role == role for item in ordered)]
-    return write_labels(canvas, _labels(ordered, K), roles if legend else [])
+    return write_labels(canvas, _labels(ordered, K), roles if legend else [], note)
 
 
 def write_overlay(

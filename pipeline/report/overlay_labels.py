@@ -39,8 +39,9 @@ def write_labels(
     canvas: UInt8[np.ndarray, "H W 3"],
     labels: Sequence[tuple[str, tuple[float, float], Role]],
     roles: Sequence[Role],
+    note: str = "",
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The canvas with labels, and with a legend of ``roles`` at the lower left.
+    """The canvas with labels, with a legend of ``roles`` at the lower left, and with a note at the lower right.
 
     ``labels``: text, the point (px) above which it is written, and role.
     """
@@ -53,6 +54,8 @@ def write_labels(
         taken.append(_draw_label(draw, font, text, (x, y - 1.6 * size), role, taken))
     if roles:
         _draw_legend(draw, font, size, roles)
+    if note:
+        _draw_note(draw, font, size, note)
     return np.asarray(picture).copy()
 
 
@@ -87,3 +90,10 @@ def _draw_legend(draw: PIL.ImageDraw.ImageDraw, font: _Font, size: int, roles: S
         y = top + pad + index * line
         draw.rectangle((pad, y + 0.45 * size, pad + 1.6 * size, y + 0.7 * size), fill=ROLE_COLOURS[role])
         draw.text((pad + 2.2 * size, y), _LEGEND[role], fill=_LEGEND_INK, font=font)
+
+
+def _draw_note(draw: PIL.ImageDraw.ImageDraw, font: _Font, size: int, note: str) -> None:
+    (w, h), pad = draw.im.size, 0.6 * size
+    left, top = w - draw.textlength(note, font=font) - 2 * pad, h - 1.5 * size - pad
+    draw.rectangle((left, top, w, h), fill=INK)
+    draw.text((left + pad, top + pad / 2), note, fill=_LEGEND_INK, font=font)

@@ -1,8 +1,10 @@
 """Datasets in other layouts than BOP19's: read, or refused with what was found instead."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ def root(tmp_path: Path) -> Path:
     return write_tiny_bop(tmp_path / "tiny")
 
 
-def open_tiny(root: Path, **options: str | None) -> Dataset:
+def open_tiny(root: Path, **options: Any) -> Dataset:
     return open_dataset(root, name="tiny", **options)
 
 
@@ -70,16 +72,78 @@ def test_models_in_other_formats_are_read(root: Path, suffix: str):
     assert model.warning == ""
 
 
-@pytest.mark.parametrize("sensors", [["cam1"], ["cam1", "cam2", "cam3"], ["photoneo"]])
-def test_files_per_sensor_are_named(root: Path, sensors: list[str]):
+def name_after_sensors(root: Path, sensors: list[str], *, modality: str = "rgb") -> Path:
+    """The tiny scene as BOP-Industrial's datasets have it; the sensors after the first see object 2 alone."""
     scene = root / "test" / "000007"
-    for sensor in sensors:
-        shutil.copy(scene / "scene_camera.json", scene / f"scene_camera_{sensor}.json")
-    open_tiny(root)  # files without a suffix are used
-    (scene / "scene_camera.json").unlink()
-    text = message(open_tiny, root)
-    assert ", ".join(sensors) in text
-    assert f"scene_camera_{sensors[0]}.json" in text
+    for number, sensor in enumerate(sensors):
+        for folder, name in (("rgb", modality), ("depth", "depth"), ("mask", "mask"), ("mask_visib", "mask_visib")):
+            shutil.copytree(scene / folder, scene / f"{name}_{sensor}")
+        for name in ("scene_camera", "scene_gt", "scene_gt_info"):
+            content = json.loads((scene / f"{name}.json").read_text())
+            if number and name != "scene_camera":
+                content["0"] = content["0"][2:]
+            write_json(scene / f"{name}_{sensor}.json", content)
+        for visible in ("mask", "mask_visib") if number else ():
+            (scene / f"{visible}_{sensor}" / "000000_000002.png").rename(
+                scene / f"{visible}_{sensor}" / "000000_000000.png"
+            )
+    for path in [p for p in scene.iterdir() if p.stem in ("rgb", "depth", "mask", "mask_visib")]:
+        shutil.rmtree(path)
+    for name in ("scene_camera", "scene_gt", "scene_gt_info"):
+        (scene / f"{name}.json").unlink()
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("sensors", "modality"), [(["cam1"], "rgb"), (["cam1", "cam2", "photoneo"], "rgb"), (["3dlong", "cam0"], "gray")]
+)
+def test_files_of_each_sensor_are_read(root: Path, sensors: list[str], modality: str):
+    before = open_tiny(root)
+    scene = name_after_sensors(root, sensors, modality=modality)
+    targets = before.targets
+    for number, sensor in enumerate(sensors):
+        dataset = open_tiny(root, sensor=sensor, targets=None)
+        assert dataset.image_path(7, 0) == scene / f"{modality}_{sensor}" / "000000.png"
+        np.testing.assert_array_equal(dataset.image(7, 0).rgb, open_tiny(root, sensor=sensors[0]).image(7, 0).rgb)
+        assert dataset.depth_mm(7, 3).max() == 400
+        assert dataset.targets == (targets if not number else tuple(t for t in targets if t.obj_id == 2))
+        for detect in (GtMask(), GtMask(visible=False), GtBbox()):
+            assert all(path.is_file() for path in detect.sources(dataset, dataset.targets))
+            assert all(d.defect is None for d in detect(dataset, dataset.targets))
+
+
+@pytest.mark.parametrize("sensors", [["cam1"], ["cam1", "cam2", "cam3"], ["photoneo"]])
+def test_without_the_choice_of_a_sensor_those_there_are_listed(root: Path, sensors: list[str]):
+    name_after_sensors(root, sensors)
+    for chosen in (None, "cam9"):
+        text = message(open_tiny, root, sensor=chosen)
+        assert f"sensors {', '.join(sensors)} and no scene_camera{'_cam9' if chosen else ''}.json" in text
+        assert f"dataset.sensor={sensors[0]}" in text
+
+
+def test_a_sensor_of_a_dataset_without_any_is_refused(root: Path):
+    assert "needs dataset.sensor=null" in message(open_tiny, root, sensor="cam1")
+
+
+@pytest.mark.parametrize("sensor", ["../cam1", "", "a/b", "cam 1", "." * 3, "x" * 99])
+def test_a_sensor_that_is_no_part_of_a_file_name_is_refused(root: Path, sensor: str):
+    assert "dataset.sensor: found" in message(open_tiny, root, sensor=sensor)
+
+
+def test_files_without_a_suffix_are_read_beside_those_of_sensors(root: Path):
+    scene = root / "test" / "000007"
+    shutil.copy(scene / "scene_camera.json", scene / "scene_camera_cam1.json")
+    assert open_tiny(root).image_path(7, 0) == scene / "rgb" / "000000.png"
+
+
+@pytest.mark.parametrize("sensor", ["cam1", "photoneo"])
+def test_width_of_a_sensor_without_images_is_that_of_its_camera_file(root: Path, sensor: str):
+    scene = name_after_sensors(root, [sensor])
+    write_json(root / "camera_a.json", {"width": 1000})
+    write_json(root / f"camera_{sensor}.json", {"width": 320})
+    shutil.rmtree(scene / f"rgb_{sensor}")
+    shutil.rmtree(scene / f"depth_{sensor}")
+    assert open_tiny(root, sensor=sensor, photographs=False).image_width(7, 0) == 320
 
 
 @pytest.mark.parametrize("detect", [GtMask(), GtMask(visible=False)])

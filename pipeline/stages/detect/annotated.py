@@ -23,14 +23,14 @@ def annotation_paths(dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
     """scene_gt.json and, where it exists, scene_gt_info.json of the targets' scenes."""
     for target in targets:
         _require_annotations(dataset, target.scene_id)
-    folders = [dataset.scene(scene_id).folder for scene_id in sorted({target.scene_id for target in targets})]
-    infos = [folder / "scene_gt_info.json" for folder in folders]
-    return [folder / "scene_gt.json" for folder in folders] + [path for path in infos if file_exists(path)]
+    scenes = [dataset.scene(scene_id) for scene_id in sorted({target.scene_id for target in targets})]
+    infos = [scene.path("scene_gt_info.json") for scene in scenes]
+    return [scene.path("scene_gt.json") for scene in scenes] + [path for path in infos if file_exists(path)]
 
 
 def _require_annotations(dataset: Dataset, scene_id: int) -> None:
     if not dataset.has_ground_truth(scene_id):
-        path = dataset.scene(scene_id).folder / "scene_gt.json"
+        path = dataset.scene(scene_id).path("scene_gt.json")
         needed = "annotations, or detect=json or cnos, which work without them, as for BOP's test sets"
         raise BadInput(path, found="no such file", needed=needed)
 

@@ -38,7 +38,7 @@ class GtBbox(Detector):
     ) -> list[Detection]:
         """One detection per annotated instance. Raises BadInput for a scene without scene_gt_info.json."""
         for scene_id in sorted({target.scene_id for target in targets}):
-            path = dataset.scene(scene_id).folder / "scene_gt_info.json"
+            path = dataset.scene(scene_id).path("scene_gt_info.json")
             if not path.exists():
                 raise BadInput(
                     describe_place(path, scene=scene_id), found="no such file", needed=f"bbox_{self.bbox} of instances"

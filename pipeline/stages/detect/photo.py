@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import ClassVar
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.images import read_mask
 from pipeline.bop.masks import encode_rle
 from pipeline.bop.photo import Photo
 from pipeline.errors import BadInput
@@ -54,12 +53,10 @@ def _read_detection(photo: Photo, target: Target) -> Detection:
         if x1 <= x0 or y1 <= y0 or x1 <= -0.5 or y1 <= -0.5 or x0 >= w - 0.5 or y0 >= h - 0.5:
             needed = f"x, y, width, height of a box inside the image of {w} x {h}"
             raise BadInput("dataset.bbox", found=[x0 + 0.5, y0 + 0.5, x1 - x0, y1 - y0], needed=needed)
-        return Detection(*ids, 1.0, 0.0, (x0, y0, x1, y1))
-    mask = read_mask(photo.mask_file, label=photo.mask_label)
-    if mask.shape != (h, w):
-        found = f"{mask.shape[1]} x {mask.shape[0]} pixels"
-        raise BadInput(photo.mask_file, found=found, needed=f"those of the photograph, {w} x {h} (width x height)")
-    box = mask_bbox(mask)
-    if box is None:
+        box = (x0, y0, x1, y1) if photo.lens is None else photo.lens.undistort_box((x0, y0, x1, y1), "dataset.bbox")
+        return Detection(*ids, 1.0, 0.0, box)
+    mask = photo.object_mask(photo.mask_file, (h, w))
+    around = mask_bbox(mask)
+    if around is None:
         raise BadInput(photo.mask_file, found="an empty mask", needed="the object's pixels not black")
-    return Detection(*ids, 1.0, 0.0, box, encode_rle(mask))
+    return Detection(*ids, 1.0, 0.0, around, encode_rle(mask))
