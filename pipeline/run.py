@@ -12,7 +12,7 @@ import torch
 
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.results import results_name
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, DzopError
 from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, plan_costs, plan_table
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.io.digests import DigestCache, track_files
@@ -33,6 +33,7 @@ from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
 from pipeline.store import Store
 
+MAX_REASONS = 4  # in the error about a photograph without a pose
 MAX_ROWS = 48  # the terminal shows longer tables by object; poses.json has every row
 
 
@@ -126,6 +127,7 @@ def _detect(graph: Graph, options: Options) -> None:
     if graph.detections.proposals:
         _make_folder(Path(options.out))
     detections = graph.detect()
+    _print_warnings(graph.detection_warnings())
     unusable = [d for d in detections if d.defect is not None]
     print(f"{len(detections) - len(unusable)} detections")
     for d in unusable[:MAX_ROWS]:
@@ -156,6 +158,16 @@ def _estimate(graph: Graph, options: Options) -> None:
     if evaluation is not None:
         cases = pictures.draw_gallery(options.gallery)
         print(f"record    {write_record(folder, answers, evaluation, cases)}")
+    if graph.context.dataset.requires_pose:
+        _require_pose(answers)
+
+
+def _require_pose(answers: Sequence[Answer]) -> None:
+    """Raise DzopError if no answer is a pose; files and pictures are written by then."""
+    missing = [answer for answer in answers if isinstance(answer, NoEstimate)]
+    if len(missing) == len(answers):
+        reasons = "; ".join(f"object {a.obj_id}: {a.stage}: {a.reason}" for a in missing[:MAX_REASONS])
+        raise DzopError(f"found no pose, needs one ({reasons}); poses.json has the reasons")
 
 
 def _print_warnings(warnings: Sequence[str]) -> None:

@@ -323,6 +323,9 @@ def test_a_photograph_without_detections_says_why(photo):
     assert ran.status == 0
     assert "0 detections" in ran.out
     assert "object 1 in scene 0, image 0: no mask was proposed in the image" in ran.out
+    ran = photo("step=estimate", "detect.proposals.min_stability=1")
+    assert ran.status == 1
+    assert ran.err.startswith("error: found no pose, needs one (object 1: detect: no mask was proposed in the image")
 
 
 def test_a_plan_of_a_photograph_runs_no_model(photo):

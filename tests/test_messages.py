@@ -1,6 +1,7 @@
 """Messages about layers, weights, failed jobs, suspicious masks, and after Ctrl-C."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -115,7 +116,7 @@ def photo(capsys, monkeypatch, tmp_path, scene):
 def test_a_suspicious_mask_is_warned_about_and_recorded(photo, tmp_path, mask, message):
     Image.fromarray(mask).save("mask.png")
     ran = photo("dataset.mask=mask.png")
-    assert ran.status == 0, ran.err
+    assert "Traceback" not in ran.err
     assert f"warning: scene 0, image 0, object 1: {message}" in ran.out
     record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
     (warning,) = record["warnings"]
@@ -137,6 +138,81 @@ def test_a_suspicious_box_or_camera_is_warned_about(photo, given, message):
     assert ran.status == 0, ran.err
     assert message in ran.out
     assert ran.out.count("warning:") == (2 if message else 0)  # before and after the pose
+
+
+@pytest.mark.parametrize(
+    ("given", "step"),
+    [("solve.min_inliers=100000", "all"), ("solve.threshold_px=1e-6", "all"), ("solve.min_inliers=100000", "estimate")],
+)
+def test_a_photograph_without_a_pose_ends_with_its_reason(photo, tmp_path, given, step):
+    ran = photo("dataset.bbox=[40,30,60,60]", given, f"step={step}")
+    assert ran.status == 1
+    (line,) = ran.err.strip().splitlines()
+    (answer,) = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())["answers"]
+    reason = f"object 1: {answer['stage']}: {answer['reason']}"
+    assert line == f"error: found no pose, needs one ({reason}); poses.json has the reasons"
+    assert list(tmp_path.glob("results/*/*/*.csv"))
+
+
+def test_a_fallback_is_a_photographs_pose(photo):
+    ran = photo("dataset.bbox=[40,30,60,60]", "solve.min_inliers=100000", "fallback=true")
+    assert ran.status == 0, ran.err
+
+
+DETECTION = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [40, 30, 60, 60], "time": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason", "step"),
+    [
+        ({"segmentation": {"size": [120, 160], "counts": [120 * 160]}}, "mask is empty", "detect"),
+        ({"segmentation": {"size": [3, 3], "counts": [9]}}, "mask of [3, 3] where the image is [120, 160]", "estimate"),
+        ({"bbox": [40, 30, 0, 60]}, "bbox [40, 30, 0, 60] has no area", "detect"),
+        ({"score": None}, "score is null, not a finite number", "detect"),
+    ],
+)
+def test_a_file_without_a_usable_detection_is_an_error_that_lists_why(dzop, tmp_path, changed, reason, step):
+    Path("found.json").write_text(json.dumps([DETECTION | changed] * 2))
+    for _ in range(2):  # the second finds them in the store
+        ran = dzop("detect=json", "detect.path=found.json", "detect.keep=all", f"step={step}")
+        assert ran.status == 1
+        (line,) = ran.err.strip().splitlines()
+        assert line.startswith("error: found.json: found 2 detections of targets and none that is usable: 2 x ")
+        assert f"2 x {reason}" in line
+        assert "(scene 1, image 0, object 1)" in line
+    assert not list(tmp_path.glob("results/*/*"))
+
+
+@pytest.mark.parametrize("broken", [b"", b"no image", None])
+def test_annotated_masks_of_which_none_is_readable_are_an_error(dzop, tmp_path, scene, broken):
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (mask,) = copy.glob("test/000001/mask_visib/*.png")
+    if broken is None:
+        Image.fromarray(np.zeros((7, 7), np.uint8)).save(mask)
+    else:
+        mask.write_bytes(broken)
+    ran = dzop(f"dataset.root={copy}", "step=detect")
+    assert ran.status == 1
+    assert "found 1 detections of targets and none that is usable: 1 x " in ran.err
+    assert len(ran.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ([DETECTION], "found.json: no entry has a mask"),
+        ([{k: v for k, v in DETECTION.items() if k != "score"}], "found.json: no entry has a score"),
+        ([], "found.json: the file has no detections"),
+        ([DETECTION | {"bbox": [0, 0, 160, 120]}], "the box covers 100% of the image"),
+    ],
+)
+def test_step_detect_prints_the_warnings_of_file_and_detections(dzop, entries, message):
+    Path("found.json").write_text(json.dumps(entries))
+    ran = dzop("detect=json", "detect.path=found.json", "step=detect")
+    assert ran.status == 0, ran.err
+    assert message in ran.out
+    assert set(ran.counts()[0]) <= {"detections"}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.bop.images import image_digest
+from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
 from pipeline.io.digests import file_digest
@@ -19,6 +21,8 @@ from pipeline.parallel import one_thread_per_kernel
 from pipeline.spec import digest
 from pipeline.stages.detect import Descriptors
 from pipeline.store import Ref, make_ref
+
+MAX_REASONS = 4  # in the error about detections of which none is usable
 
 
 @dataclass(eq=False)
@@ -55,12 +59,17 @@ class DetectionNodes:
 
     @cached_property
     def all(self) -> list[Detection]:
-        """Detections of the targets, read from the store or computed."""
+        """Detections of the targets, read from the store or computed.
+
+        Raises BadInput if they come from files and none is usable; a detector may find nothing.
+        """
         store, is_new = self.context.store, not self.context.store.is_complete(self.ref)
         if is_new:
             detections = self._detect()
             store.put_document(self.ref, [detection_to_record(d) for d in detections], rows=len(detections))
         detections = [detection_from_record(record) for record in store.read(self.ref).document]
+        if self.proposals is None and detections and all(d.defect for d in detections):
+            raise self._no_usable_detection(detections)
         self.context.progress.add("detections", **{"computed" if is_new else "reused": len(detections)})
         return detections
 
@@ -68,6 +77,16 @@ class DetectionNodes:
         """The part of a detection that poses depend on: without seconds measured here, which differ in every run."""
         record = detection_to_record(detection)
         return record | {"time_s": 0.0} if self.proposals else record
+
+    def _no_usable_detection(self, detections: Sequence[Detection]) -> BadInput:
+        """The error that lists why, with the first of each reason."""
+        context, first = self.context, {d.defect: d for d in reversed(detections)}
+        counts = Counter(d.defect for d in detections).most_common(MAX_REASONS)
+        places = [(first[why], n) for why, n in counts]
+        reasons = [f"{n} x {d.defect} (scene {d.scene_id}, image {d.im_id}, object {d.obj_id})" for d, n in places]
+        files = context.stages.detect.sources(context.dataset, context.targets)
+        found = f"{len(detections)} detections of targets and none that is usable: {'; '.join(reasons)}"
+        return BadInput(files[0] if files else "detect", found=found, needed="at least one usable detection")
 
     @one_thread_per_kernel()
     def _detect(self) -> list[Detection]:

@@ -83,6 +83,10 @@ class Graph:
         """Detections of all targets, including those that cannot be used."""
         return self.detections.all
 
+    def detection_warnings(self) -> list[str]:
+        """Results of sanity checks on detections and cameras, one line each; no mesh is read for them."""
+        return detection_warnings(self.context, self.detect(), cached=True)
+
     def warnings(self) -> list[str]:
         """Results of sanity checks on detections, cameras and meshes, one line each; cached runs read no mesh."""
         detections, cached = self.detect(), self.context.store.is_complete(self.poses.run_ref())
