@@ -17,6 +17,7 @@ from pipeline.bop.photo import PhotoConfig
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.io.meshes import write_ply
+from pipeline.stages.detect.json import Json
 from pipeline.stages.detect.photo import PhotoMask
 from pipeline.stages.render.raycast import Raycast
 from pipeline.synthetic.objects import make_object
@@ -166,6 +167,15 @@ def test_a_box_is_moved_with_the_photograph(distorted):
     assert np.abs(moved - (box[0], box[1], box[0] + box[2], box[1] + box[3])).max() > 10
     (plain,) = PhotoMask()(photo_config(folder, mask=None, bbox=box).open(), photo.targets)
     assert plain.bbox_xyxy == (box[0] - 0.5, box[1] - 0.5, box[0] + box[2] - 0.5, box[1] + box[3] - 0.5)
+
+
+def test_detections_from_a_file_are_said_to_be_those_of_the_undistorted_photograph(distorted, tmp_path):
+    entry = {"scene_id": 0, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [220, 140, 80, 80], "time": 0.1}
+    (tmp_path / "found.json").write_text(json.dumps([entry]))
+    for given, said in (({"distortion": LENS}, True), ({}, False)):
+        photo = photo_config(distorted[0], mask=None, **given).open()
+        warnings = Json(path=str(tmp_path / "found.json")).warnings(photo, photo.targets)
+        assert any("those of the undistorted photograph" in warning for warning in warnings) == said
 
 
 def test_key_of_the_photograph_depends_on_coefficients_and_camera(distorted):

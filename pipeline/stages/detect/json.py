@@ -76,6 +76,8 @@ class Json(Detector):
         path = self._file()
         entries, warnings = read_entries(path, dataset.targets)
         warnings += check_ids(path, entries, dataset.targets)
+        if dataset.image_note:
+            warnings.append(f"{path.name}: its boxes and masks are taken to be those of the {dataset.image_note}")
         asked = {(target.scene_id, target.im_id, target.obj_id) for target in targets}
         entries = [entry for entry in entries if entry.target in asked]
         return entries, warnings + check_boxes_and_masks(path, entries, dataset.image_size)
