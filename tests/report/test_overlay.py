@@ -63,6 +63,16 @@ def test_estimates_are_drawn_over_ground_truth_in_any_order():
     assert coloured(draw_overlay(photo(), [truth, estimate])[:500], "correct").sum() > 500
 
 
+@pytest.mark.parametrize("size_hw", [(160, 200), (480, 640), (1080, 1920)])
+def test_a_note_is_written_at_the_lower_right_alone(size_hw: tuple[int, int]):
+    plain, noted = draw_overlay(photo(*size_hw), []), draw_overlay(photo(*size_hw), [], note="undistorted photograph")
+    ys, xs = np.nonzero((plain != noted).any(axis=-1))
+    h, w = plain.shape[:2]
+    assert (ys.max(), xs.max()) == (h - 1, w - 1)
+    assert ys.min() > 0.9 * h
+    assert w / 2 < xs.min() < w - 60
+
+
 def test_legend_names_only_what_is_drawn():
     picture = draw_overlay(photo(), [DrawnPose(CUBE, at(0, 0, -300), "wrong")])
     assert coloured(picture, "wrong")[500:, :300].any()
