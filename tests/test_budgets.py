@@ -13,6 +13,8 @@ import pytest
 import torch
 from command import CommandResult, run_dzop
 from huggingface_hub.errors import LocalEntryNotFoundError
+from make_sd15 import write_folder
+from make_vit import write_vit
 
 from pipeline.backbones.batching import Footprint, compute_batch_size
 from pipeline.errors import BadInput
@@ -202,3 +204,43 @@ def test_a_plan_downloads_no_weights_and_names_the_missing_ones(dzop, monkeypatc
     assert "its revision is not known offline" in last
     assert dzop(f"method={method}", "extract=stable_diffusion", "weights.stable_diffusion=some/model").status == 1
     assert not asked[-1]
+
+
+_PASSES = """
+import sys
+import numpy as np
+import psutil
+import torch
+from benchmarks.measure import peak_bytes
+from pipeline.backbones.batching import bytes_of_batch
+from pipeline.items.views import Crops
+from pipeline.parallel import use_threads
+from pipeline.spec import Runtime
+from pipeline.stages.extract.dino import Dino
+from pipeline.stages.extract.stable_diffusion import StableDiffusion
+use_threads(2)
+name, weights = sys.argv[1:]
+spec = {
+    "dino": lambda: Dino(weights=weights, input_size=224),
+    "stable_diffusion": lambda: StableDiffusion(weights=weights, input_size=256),
+}[name]()
+layers = [2, 5, 8, 11]
+backbone = spec.load(Runtime(device="cpu"))
+n = backbone.passes.size * 2
+rgb = np.random.default_rng(0).integers(0, 256, (n, 128, 128, 3), dtype=np.uint8)
+crops = Crops(rgb, np.ones((n, 128, 128), bool), np.tile(np.eye(3), (n, 1, 1)))
+before = psutil.Process().memory_info().rss
+backbone(crops, layers)
+print(peak_bytes() - before, bytes_of_batch(spec.footprint(layers, 128), n, torch.device("cpu")))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dino", "stable_diffusion"])
+def test_two_passes_at_the_same_time_take_no_more_than_the_estimate(name: str, tmp_path: Path) -> None:
+    weights = {"dino": write_vit, "stable_diffusion": write_folder}[name](tmp_path / "w")
+    command = [sys.executable, "-c", _PASSES, name, str(weights)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    peak, estimate = map(int, done.stdout.split()[-2:])
+    assert 0.3 * estimate < peak <= estimate
