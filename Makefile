@@ -90,7 +90,7 @@ test-fast: $(STAMP) ## the tests that take less than 20 seconds each
 	$(PY) -m pytest -m "not slow and not faults" $(ARGS)
 
 test-faults: $(STAMP) ## faults injected for real (50 kills of every step, full disk, flipped bytes, ...) and long fuzzing, counts printed
-	DZOP_FUZZ=$${DZOP_FUZZ:-1000} $(PY) -m pytest -m "faults or not faults" tests/faults tests/untrusted_input tests/store tests/test_determinism.py $(ARGS)
+	DZOP_FUZZ=$${DZOP_FUZZ:-1000} $(PY) -m pytest -m "faults or not faults" tests/faults tests/untrusted_input tests/store tests/graph tests/test_determinism.py $(ARGS)
 
 lint: $(STAMP) ## check style, types and import contracts
 	$(PY) -m ruff check .

@@ -16,17 +16,11 @@ CREDENTIALS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "A
 
 
 def _serve_s3() -> Any:
-    """moto's S3 alone, with connections that stay open and no log.
-
-    moto's own server lists moto's folders at every request, to find which service it is for, and opens a connection
-    and a thread for each.
-    """
+    """moto's S3 alone, without a log: moto's own server lists its folders at every request to find a service."""
     from moto.moto_server.werkzeug_app import MotoRequestHandler, create_backend_app
     from werkzeug.serving import make_server
 
     class Handler(MotoRequestHandler):
-        protocol_version = "HTTP/1.1"
-
         def log_request(self, *args: Any) -> None:
             return
 

@@ -1,5 +1,6 @@
 """On the CPU, the bytes of every entry depend neither on the batch, nor on threads, nor on the number of processes."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -72,22 +73,37 @@ def test_bytes_of_entries_depend_neither_on_batch_nor_on_threads(results, scene,
 
 
 @pytest.mark.faults
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.timeout(7200)
 def test_bytes_on_photographs_depend_neither_on_batch_nor_on_threads_nor_on_processes(
-    results, bop_mini, tmp_path, method
+    bop_mini, tmp_path, capsys, monkeypatch, record_property
 ):
-    data = ("dataset=lmo", f"dataset.root={bop_mini}/lmo", "select.images=[3,61,102]", "render.count=24")
-    first = results("first", *data, *METHODS[method], "threads=1")
-    assert len(first["csv"].splitlines()) == 25  # with the head
+    """The methods of one setting share a store: what they have in common is computed and compared once."""
+    data = ("dataset=lmo", f"dataset.root={bop_mini}/lmo", "select.images=[3,61,102]", "render.count=24", *QUIET)
+
+    def places(name: str, method: str) -> tuple[str, ...]:
+        return (f"store.root={tmp_path}/{name}/cache", f"out={tmp_path}/{name}/{method}")
+
+    def compute(name: str, *setting: str) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for method, stages in METHODS.items():
+            ran = run_dzop(capsys, monkeypatch, *places(name, method), *data, *stages, *setting)
+            assert ran.status == 0, ran.err
+            found[method] = poses(tmp_path / name / method)
+        found |= contents(Store(LocalStoreConfig(root=f"{tmp_path}/{name}/cache")))
+        shutil.rmtree(tmp_path / name / "cache")
+        return found
+
+    first = compute("first", "threads=1")
+    assert [len(first[method].splitlines()) for method in METHODS] == [25, 25, 25]  # with the head
     for n, setting in enumerate(SETTINGS):
-        assert differences(first, results(str(n), *data, *METHODS[method], *setting)) == []
-    places = (f"store.root={tmp_path}/shared/cache", *QUIET, *data, *METHODS[method])
-    command = [sys.executable, "-m", "pipeline", *places, "step=estimate"]
-    started = [subprocess.Popen([*command, f"out={tmp_path}/shared/{n}", f"threads={n}"], cwd=ROOT) for n in (1, 2)]
-    assert [process.wait(1200) for process in started] == [0, 0]
-    together = results("shared", *data, *METHODS[method])
-    assert differences(first, together) == []
+        assert differences(first, compute(str(n), *setting)) == []
+    for method, stages in METHODS.items():
+        command = [sys.executable, "-m", "pipeline", *data, *stages, "step=estimate", *places("shared", method)]
+        started = [subprocess.Popen([*command, f"out={tmp_path}/{n}", f"threads={n}"], cwd=ROOT) for n in (1, 2)]
+        assert [process.wait(3000) for process in started] == [0, 0]
+    assert differences(first, compute("shared")) == []
+    text = f"{len(first)} arrays, documents and results files of 24 targets and {len(METHODS)} methods"
+    record_property("summary", f"{text}: equal with {', '.join(map(str, SETTINGS))}, and of two processes")
 
 
 @pytest.mark.parametrize("name", ["hog", "pixels", "coordinates", "random_sd", "embedded", "dino", "dinov2", "fusion"])

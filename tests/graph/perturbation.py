@@ -86,10 +86,10 @@ class TinyRun:
 
 def digest_entries(store: Store) -> dict[str, str]:
     """Digest of each complete entry's arrays and document, by its path."""
-    return {info.path: _digest_entry(store, info) for info in list_entries(store) if info.complete}
+    return {info.path: entry_digest(store, info) for info in list_entries(store) if info.complete}
 
 
-def _digest_entry(store: Store, info: Any) -> str:
+def entry_digest(store: Store, info: Any) -> str:
     entry = store.read(info.ref)
     arrays = [[name, sha256(entry.array(name).tobytes()).hexdigest()] for name in entry.arrays]
     return digest([arrays, _without_seconds(entry.document)])
