@@ -56,7 +56,7 @@ pictures: $(STAMP) ## make the pictures of README and docs; ARGS=--diagrams make
 	$(PY) -m docs.pictures $(ARGS)
 
 ablations: $(STAMP) ## run the paper's ablations on the demo data; ARGS="dataset=lmo dataset.root=..." for others
-	$(PY) -m pipeline dataset=demo method=dzop $(ARGS)
+	$(PY) -m pipeline dataset=demo method=dzop_paper detect=gt_bbox $(ARGS)
 	@$(call sweep,$(PAPER))
 
 sweeps: $(STAMP) ## run ablations that are not in the paper, on the demo data

@@ -33,7 +33,7 @@ from pipeline.cli.cache import cache_command
 from pipeline.cli.fetch import fetch_command
 from pipeline.cli.reproduce import reproduce_command
 from pipeline.cli.score import lint_command, score_command
-from pipeline.cli.sweep import FailedJobs, failures_text, record_failed_job
+from pipeline.cli.sweep import SweepJobs, failures_text, record_failed_job, record_finished_job, same_answers_text
 from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
 from pipeline.configuration import (
     CONF,
@@ -150,12 +150,14 @@ def _format_error(error: BaseException) -> str:
 
 def _run_jobs() -> None:
     """Run one job, or all jobs of a sweep. Exits with one line that names the jobs that failed."""
-    failed_jobs = FailedJobs.start()
+    jobs = SweepJobs.start()
     try:
         _hydra_main()
-        failed = failed_jobs.read()
+        failed, note = jobs.failed(), same_answers_text(jobs.finished())
     finally:
-        failed_jobs.remove()
+        jobs.remove()
+    if note:
+        print(f"\n{note}")
     if failed:
         sys.exit(f"error: {len(failed)} of the sweep's jobs failed: {failures_text(failed, sys.argv)}")
 
@@ -165,7 +167,10 @@ def _hydra_main(config: DictConfig) -> None:
     """Run one job. A sweep goes on after a job that fails, whatever the error."""
     sweeping = HydraConfig.get().mode is RunMode.MULTIRUN
     try:
-        _run_job(config, resume=sweeping)
+        answers = _run_job(config, resume=sweeping)
+        if sweeping:
+            job = HydraConfig.get()
+            record_finished_job(int(job.job.num), list(job.overrides.task), answers)
     except MissingMandatoryValue as error:
         needed = NEEDED.get(str(error.full_key), "a value: the yaml in conf/ says which")
         _fail_job(config, BadInput(error.full_key, found="nothing", needed=needed))
@@ -182,7 +187,8 @@ def _hydra_main(config: DictConfig) -> None:
         _fail_job(config, DzopError(f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"))
 
 
-def _run_job(config: DictConfig, *, resume: bool) -> None:
+def _run_job(config: DictConfig, *, resume: bool) -> str:
+    """Run one job; returns the digest of its answers, "" for none."""
     # plain dicts: nothing below knows OmegaConf
     values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     check_fields(values)
@@ -190,10 +196,10 @@ def _run_job(config: DictConfig, *, resume: bool) -> None:
         if values["plan"]:
             raise BadInput("plan=true step=report", found="a step without a plan", needed="plan=false, or another step")
         make_report(values["out"])
-        return
+        return ""
     # Building stages hashes weights already: the files of a run are tracked from here on.
     with track_files(), offline() if values["plan"] is True else nullcontext():
-        run(
+        return run(
             stages=build_stages(values),
             dataset=build_variant(values["dataset"], "dataset"),
             store=Store(build_variant(values["store"], "store"), announce=lambda text: print(text, file=sys.stderr)),

@@ -104,5 +104,10 @@ class Options:
 
     @property
     def name(self) -> str:
-        """Method and extractor, for file names; without underscores, as BOP's format requires."""
+        """Method and extractor; without underscores, as BOP's format requires of file names."""
         return f"{self.method}-{self.label['extract']}".replace("_", "-")
+
+    @property
+    def file_name(self) -> str:
+        """``name`` and the detect variant: the method in the name of the results file."""
+        return f"{self.name}-{self.label['detect']}".replace("_", "-")

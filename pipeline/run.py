@@ -23,7 +23,7 @@ from pipeline.options import Options
 from pipeline.outputs.files import errors_by_answer, places_text, write_computed_detections, write_files
 from pipeline.outputs.folder import OutputFolder
 from pipeline.outputs.pictures import Pictures
-from pipeline.outputs.records import write_record
+from pipeline.outputs.records import digest_answers, write_record
 from pipeline.parallel import use_threads
 from pipeline.progress import Progress
 from pipeline.report.run_records import read_run_records
@@ -45,12 +45,15 @@ class DatasetSource(Protocol):
         ...
 
 
-def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtime, options: Options) -> None:
-    """Run one configuration and print what was done and where the results are. Raises DzopError."""
+def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtime, options: Options) -> str:
+    """Run one configuration and print what was done and where the results are. Raises DzopError.
+
+    Returns the digest of the answers, "" for a run that gives none.
+    """
     start = time.perf_counter()
     use_threads(options.threads)
     # Names that no results file can have are refused now, not when everything is computed.
-    results_name(options.name, getattr(dataset, "name", "data"), getattr(dataset, "split", "test"))
+    results_name(options.file_name, getattr(dataset, "name", "data"), getattr(dataset, "split", "test"))
     folder = store.backend.folder
     with track_files(None if folder is None else DigestCache(folder / ".digests")):
         data = dataset.open()
@@ -59,10 +62,11 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
             graph = Graph(context)
             if options.plan:
                 _print_plan(graph, options)
-                return
-            _run_step(graph, options)
+                return ""
+            answers = _run_step(graph, options)
     seconds = time.perf_counter() - start
     print(f"\n{context.progress.table()}\n{'total':<20}{'':>20}{seconds:>10.1f}", flush=True)
+    return answers
 
 
 def make_report(out: str) -> None:
@@ -72,8 +76,8 @@ def make_report(out: str) -> None:
     print(write_report(read_run_records(Path(out)), Path(out)).summary)
 
 
-def _run_step(graph: Graph, options: Options) -> None:
-    """Check the configuration, then compute the step that was asked for and whatever it needs."""
+def _run_step(graph: Graph, options: Options) -> str:
+    """Check the configuration, then compute the step that was asked for and whatever it needs. Returns as ``run``."""
     graph.check()
     graph.limit_vram()
     print(_headline(graph.context, options), flush=True)
@@ -83,7 +87,8 @@ def _run_step(graph: Graph, options: Options) -> None:
         elif options.step == "detect":
             _detect(graph, options)
         else:
-            _estimate(graph, options)
+            return _estimate(graph, options)
+        return ""
     except torch.cuda.OutOfMemoryError as error:
         needed = "a smaller runtime.batch (0 = sized to memory), extract.dtype=float16, or a larger runtime.max_vram"
         found = " ".join(str(error).split())[:200]
@@ -136,14 +141,18 @@ def _detect(graph: Graph, options: Options) -> None:
         print(f"written   {write_computed_detections(OutputFolder(graph, None, options))}")
 
 
-def _estimate(graph: Graph, options: Options) -> None:
-    """Estimate and, unless step=estimate, score the poses; write their files and pictures and print their tables."""
+def _estimate(graph: Graph, options: Options) -> str:
+    """Estimate and, unless step=estimate, score the poses; write their files and pictures and print their tables.
+
+    Returns the digest of the answers.
+    """
     _make_folder(Path(options.out))
     scores = _score_nodes(graph, options)
     folder = OutputFolder(graph, scores, options)
     if options.resume and scores is not None and folder.is_finished():
         print(f"already finished: {folder.record}")
-        return
+        before = folder.earlier_record()
+        return before.answers if before else ""
     warnings = graph.warnings()
     _print_warnings(warnings)
     answers = graph.estimate()
@@ -152,7 +161,7 @@ def _estimate(graph: Graph, options: Options) -> None:
     pictures = Pictures(folder, answers, evaluation)
     if options.overlays:
         pictures.draw_overlays()
-    _print_results(answers, evaluation, theta_max=options.evaluate.theta_max)
+    _print_results(answers, evaluation, folder.context.stages.detect.summary, theta_max=options.evaluate.theta_max)
     _print_warnings(warnings)
     print(places_text(folder, overlays=options.overlays))
     if evaluation is not None:
@@ -160,6 +169,7 @@ def _estimate(graph: Graph, options: Options) -> None:
         print(f"record    {write_record(folder, answers, evaluation, cases)}")
     if graph.context.dataset.requires_pose:
         _require_pose(answers)
+    return digest_answers(answers)
 
 
 def _require_pose(answers: Sequence[Answer]) -> None:
@@ -201,7 +211,9 @@ def _score_nodes(graph: Graph, options: Options) -> ScoreNodes | None:
     return graph.scores(scorer, correspondences=evaluate.correspondences)
 
 
-def _print_results(answers: Sequence[Answer], evaluation: PoseEvaluation | None, *, theta_max: float) -> None:
+def _print_results(
+    answers: Sequence[Answer], evaluation: PoseEvaluation | None, detections: str, *, theta_max: float
+) -> None:
     rows = list(zip(answers, errors_by_answer(answers, evaluation), strict=True))
     print("\n" + (answers_table(rows) if len(rows) <= MAX_ROWS else objects_table(rows)))
     failures = [answer for answer in answers if isinstance(answer, NoEstimate)]
@@ -211,7 +223,8 @@ def _print_results(answers: Sequence[Answer], evaluation: PoseEvaluation | None,
     print(f"\n{len(answers) - len(failures)} poses, {len(failures)} without{reasons}")
     if evaluation is None:
         return
-    print(scores_table(evaluation.scored, theta_max=theta_max))
+    print(f"\nscores on {detections}")
+    print(scores_table(evaluation.scored, theta_max=theta_max).lstrip("\n"))
     if evaluation.correspondences:
         median = np.median(list(evaluation.correspondences.values()))
         print(f"correspondences: median error {median:.1%} of the diameter, parallel to the image plane")
@@ -223,6 +236,6 @@ def _headline(context: Context, options: Options) -> str:
     renderer = stages.render.kind.split(".")[-1]
     lines = [
         f"{options.name} on {data.name} {data.split}: {len(targets)} targets, {images} images, {objects} objects",
-        f"renderer {renderer}, features {stages.extract.model}, store {context.store.place}",
+        f"{stages.detect.summary}, renderer {renderer}, features {stages.extract.model}, store {context.store.place}",
     ]
     return "\n".join([*lines, *filter(None, [stages.extract.notice])])

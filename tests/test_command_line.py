@@ -62,7 +62,7 @@ def test_one_command_estimates_poses_and_a_second_one_computes_nothing(dzop, tmp
     assert made["templates"] == made["template features"] == (24, 0)
     assert made["query features"] == made["poses"] == (4, 0)
     folder = results(tmp_path)
-    rows = read_results(folder / "dzop-hog_toy-test.csv")
+    rows = read_results(folder / "dzop-hog-gt-mask_toy-test.csv")
     record = json.loads((folder / "poses.json").read_text())
     assert len(record["answers"]) == 4
     assert len(rows) == sum(answer["status"] == "estimate" for answer in record["answers"])
@@ -237,11 +237,11 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
     mask = run_dzop(capsys, monkeypatch, *given, f"dataset.mask={frame}/mask_visib/000000_000000.png")
     assert mask.status == 0, mask.err
     assert "1 poses, 0 without" in mask.out or "0 poses, 1 without" in mask.out
-    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*/overlays/*.jpg"))) == 1
+    assert len(list(tmp_path.glob("results/dzop-hog-photo_photo-test/*/overlays/*.jpg"))) == 1
     box = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,60]")
     other = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,70]")
     assert box.status == other.status == 0
-    assert len(list(tmp_path.glob("results/dzop-hog_photo-test/*"))) == 3  # another box is another run
+    assert len(list(tmp_path.glob("results/dzop-hog-photo_photo-test/*"))) == 3  # another box is another run
 
 
 @pytest.mark.parametrize(

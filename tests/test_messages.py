@@ -14,7 +14,7 @@ from command import CommandResult, restore_ctrl_c, run_dzop
 from make_vit import write_vit
 from PIL import Image
 
-from pipeline.cli.sweep import failures_text
+from pipeline.cli.sweep import failures_text, same_answers_text
 from pipeline.report.run_records import read_run_records, unresolved_failures
 from pipeline.synthetic.scenes import write_dataset
 
@@ -267,3 +267,35 @@ def test_ctrl_c_during_imports_prints_no_traceback(tmp_path):
     out, err = process.communicate(timeout=60)
     assert process.returncode in (-signal.SIGINT, 1)
     assert b"Traceback" not in out + err
+
+
+def test_a_sweep_that_changed_no_answer_is_noted():
+    def note(*jobs: tuple[str, str]) -> str:
+        return same_answers_text([(f"dataset=lmo {overrides}".split(), answers) for overrides, answers in jobs])
+
+    said = "changed no answer: all 2 jobs gave the same poses and scores"
+    assert note(("a=1", "x"), ("a=2", "x")) == f"note: a {said}"
+    assert note(("a=1 b=1", "x"), ("a=2 b=2", "x")) == f"note: a and b {said}"
+    assert note(("a=1", "x"), ("a=2", "y")) == ""
+    assert note(("a=1", "x")) == ""
+    assert note(("evaluate.theta_max=0.1", "x"), ("evaluate.theta_max=0.2", "x")) == ""
+
+
+def test_detections_and_settings_without_effect_are_named_at_the_start_and_recorded(dzop, tmp_path):
+    ran = dzop("match.top_k=9", "cluster=one")
+    assert ran.status == 0, ran.err
+    start, record = (
+        ran.out.split("scene  image")[0],
+        json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text()),
+    )
+    for said in (
+        "match.top_k 9 is more than the 6 templates",
+        "correspond.per_cluster 10 has no effect with cluster=one",
+    ):
+        assert said in start + ran.err
+        assert any(said in warning for warning in record["warnings"])
+    assert "ground-truth masks (oracle), renderer" in start
+    assert record["detections"] == "ground-truth masks (oracle)"
+    assert next(tmp_path.glob("results/*/*/*.csv")).name == "dzop-hog-gt-mask_toy-test.csv"
+    (row,) = read_run_records(tmp_path / "results")
+    assert row.detections == "ground-truth masks (oracle)"

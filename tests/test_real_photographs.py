@@ -28,14 +28,14 @@ def test_every_target_has_a_pose_or_a_reason(bop_mini, capsys, monkeypatch, tmp_
     monkeypatch.chdir(tmp_path)
     ran = run_dzop(capsys, monkeypatch, f"dataset={name}", f"dataset.root={bop_mini / name}", *QUICK, *chosen)
     assert ran.status == 0, ran.err
-    folder = next(tmp_path.glob(f"results/dzop-hog_{name}-test/*"))
+    folder = next(tmp_path.glob(f"results/dzop-hog-gt-mask_{name}-test/*"))
     answers = json.loads((folder / "poses.json").read_text())["answers"]
     asked = json.loads((bop_mini / name / "test_targets_bop19.json").read_text())
     shown = {(a["scene_id"], a["im_id"], a["obj_id"]) for a in answers}
     wanted = {(t["scene_id"], t["im_id"], t["obj_id"]) for t in asked}
     assert shown <= wanted
     assert len(shown) == len(answers) == targets
-    rows = read_results(folder / f"dzop-hog_{name}-test.csv")
+    rows = read_results(folder / f"dzop-hog-gt-mask_{name}-test.csv")
     assert len(rows) == sum(a["status"] == "estimate" for a in answers)
     assert all(a["status"] == "estimate" or a["reason"] for a in answers)
     pictures = sorted((folder / "overlays").glob("*.jpg"))

@@ -188,14 +188,10 @@ def test_a_finished_job_is_repeated_when_its_files_are_gone(dzop, tmp_path):
     assert "already finished" in dzop(*job).out
 
 
-@pytest.mark.parametrize(("sweep", "jobs"), [("correspondence", 4), ("ladder", 4), ("theta", 6)])
-def test_a_sweep_yaml_records_every_job(dzop, tmp_path, sweep, jobs):
-    done = dzop(f"sweep={sweep}")
-    assert done.status == 0, done.err
+def test_a_ladder_of_oracles_climbs(dzop, tmp_path):
+    assert dzop("sweep=ladder").status == 0
     rows = read_run_records(tmp_path / "results")
-    assert len(rows) == jobs
-    assert {row.sweep for row in rows} == {sweep}
-    if sweep == "ladder":
-        recall = {row.config["variation"]: row.metrics["AR_MSPD"] for row in rows}
-        assert recall["oracle_correspondences"] == 1.0
-        assert recall["oracle_mask"] == recall["none"]  # the detections are true masks already
+    recall = {row.config["variation"]: row.metrics["AR_MSPD"] for row in rows}
+    assert len(recall) == 4
+    assert recall["oracle_correspondences"] == 1.0
+    assert recall["oracle_mask"] == recall["none"]  # the detections are true masks already

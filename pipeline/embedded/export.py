@@ -10,9 +10,10 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from pipeline.embedded.networks import UNET, VAE
+from pipeline.embedded.networks import HOOK, IMAGE_PX, TIMESTEP, UNET, VAE
 from pipeline.embedded.plan import TrainingFolder
-from pipeline.io.files import write_atomic
+from pipeline.io.files import write_atomic, write_json
+from pipeline.stages.extract.embedded import Embedded, digest_weights
 
 MAX_BYTES = 25_000_000
 SCHEDULER = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
@@ -43,7 +44,16 @@ def export(training: TrainingFolder, folder: Path) -> int:
         raise ValueError(f"found {size} bytes of weights, needs at most {MAX_BYTES}")
     for name, content in files.items():
         write_atomic(folder / name, content)
+    if descriptors is not None:
+        write_json(folder / "head.json", describe_features(folder))
     return size
+
+
+def describe_features(folder: Path) -> dict[str, Any]:
+    """What the head was trained on: the recipe of an extractor of the exported weights, for fuse=learned to compare."""
+    extract = Embedded(weights="learned", hook=HOOK, input_size=IMAGE_PX, timestep=TIMESTEP, noise="none")
+    fields = {name: getattr(extract, name) for name in ("kind", "hook", "input_size", "timestep", "noise")}
+    return fields | {"weights": f"learned {digest_weights(folder, 'learned')}"}
 
 
 def _sample_curve(training: TrainingFolder, stage: str) -> list[dict[str, float]]:

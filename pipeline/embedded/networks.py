@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pipeline.backbones.stable_diffusion.decoder import map_shape, read_decoder_maps
+from pipeline.backbones.stable_diffusion.decoder import Hook, map_shape, read_decoder_maps
 from pipeline.backbones.stable_diffusion.features import encode_latent, to_network_image
 from pipeline.backbones.stable_diffusion.loading import build_untrained
 from pipeline.embedded.plan import TrainingFolder
@@ -16,6 +16,7 @@ from pipeline.stages.extract.embedded import PROMPT
 
 LAYERS, MATCH_LAYER, DIM, TIMESTEP = (2, 5, 8, 11), 8, 64, 50
 IMAGE_PX = 128
+HOOK: Hook = "pre"
 UNET: dict[str, Any] = {
     "sample_size": 32,
     "in_channels": 8,
@@ -55,14 +56,14 @@ class DescriptorNetwork(nn.Module):
     def __init__(self, unet: nn.Module) -> None:
         super().__init__()
         self.unet = unet
-        self.head = Aggregation({k: map_shape(UNET, layer=k, hook="pre", latent_size=32)[0] for k in LAYERS}, DIM)
+        self.head = Aggregation({k: map_shape(UNET, layer=k, hook=HOOK, latent_size=32)[0] for k in LAYERS}, DIM)
         self.log_scale = nn.Parameter(torch.tensor([15.0, 20.0, 20.0]).log())
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Descriptors, and the map of the layer that templates are matched by."""
         with mixed_precision(latent.device):
             text = zero_prompt(1, latent.device)
-            maps = read_decoder_maps(self.unet, latent, TIMESTEP, text, layers=LAYERS, hook="pre")
+            maps = read_decoder_maps(self.unet, latent, TIMESTEP, text, layers=LAYERS, hook=HOOK)
             maps = {k: m.float() for k, m in maps.items()}
             return self.head(maps), maps[MATCH_LAYER]
 

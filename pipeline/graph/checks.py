@@ -44,13 +44,26 @@ def check_layers(stages: Stages) -> None:
             raise BadInput(field_of_layer[layer], found=error.found, needed=needed) from None
 
 
+def settings_warnings(stages: Stages) -> list[str]:
+    """One line per setting that cannot do what it says, because another one leaves it nothing to choose from."""
+    warnings = []
+    top_k, views = getattr(stages.match, "top_k", 0), stages.render.count_views()
+    if views is not None and top_k > views:
+        warnings.append(f"match.top_k {top_k} is more than the {views} templates of an object: all of them are kept")
+    if stages.cluster.kind == "cluster.one" and hasattr(stages.correspond, "per_cluster"):
+        per_cluster = stages.correspond.per_cluster
+        warnings.append(f"correspond.per_cluster {per_cluster} has no effect with cluster=one: all matches are kept")
+    return warnings
+
+
 def detection_warnings(context: Context, detections: Sequence[Detection], *, cached: bool = False) -> list[str]:
-    """Warnings of dataset, models and detector, then one line per suspicious camera, then one per detection.
+    """Warnings of settings, dataset, models and detector, then one line per suspicious camera, then one per detection.
 
     ``cached``: whether all poses are stored. Cameras are checked only without ground truth: annotated poses show that
     a camera is right.
     """
-    warnings = [*context.dataset.warnings, *_check_models(context, cached=cached)]
+    warnings = [*settings_warnings(context.stages), *context.dataset.warnings]
+    warnings += _check_models(context, cached=cached)
     warnings += context.stages.detect.warnings(context.dataset, context.targets)
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
         annotated = context.dataset.has_ground_truth(scene_id)

@@ -44,7 +44,7 @@ class Graph:
         runtime, stages = self.context.runtime, self.context.stages
         self.context.store.made_by = describe_machine(runtime.torch_device())
         _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for what is not a size
-        stages.fuse.check(stages.extract.model)
+        stages.fuse.check(stages.extract)
         check_layers(stages)
         if self.detections.proposals:
             if where := self.context.dataset.location_field:

@@ -36,6 +36,7 @@ def write_files(
         "run": folder.graph.poses.run_ref().key,
         "method": folder.options.name,
         "dataset": folder.context.dataset.name,
+        "detections": folder.context.stages.detect.summary,
         "config": folder.options.config,
         "counts": folder.context.progress.as_record(),
         "scores": evaluation and summary_of(evaluation.scored),

@@ -37,7 +37,7 @@ class OutputFolder:
     def csv_name(self) -> str:
         """File name of the BOP results."""
         data = self.context.dataset
-        return results_name(self.options.name, data.name, data.split)
+        return results_name(self.options.file_name, data.name, data.split)
 
     @cached_property
     def path(self) -> Path:

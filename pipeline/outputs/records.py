@@ -14,12 +14,15 @@ import numpy as np
 from pipeline.graph import PoseEvaluation
 from pipeline.items.errors import TemplateError
 from pipeline.items.poses import NoEstimate, PoseEstimate
-from pipeline.items.records import Answer
+from pipeline.items.records import Answer, answer_to_record
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.run_records import Case, RunRecord, finished_run_record, run_id, write_run_record
 from pipeline.report.scores import summary_of
 from pipeline.scoring import dataset_id
+from pipeline.spec import digest
+
+_ANSWER_FIELDS = ("status", "scene_id", "im_id", "obj_id", "detection_id", "T_cam_obj", "score")
 
 
 def write_record(
@@ -68,10 +71,12 @@ def _make_record(
         label=options.label,
         sweep=options.sweep or "",
         notice=context.stages.extract.notice,
+        detections=context.stages.detect.summary,
         dataset=dataset_id(folder.scores.scorer),
         run=folder.scores.ref.key,
         folder=folder.path.relative_to(folder.out).as_posix(),
         csv=folder.csv_name,
+        answers=digest_answers(answers),
         estimates=sum(isinstance(answer, PoseEstimate) for answer in answers),
         counts=context.progress.as_record(),
         times_s=_median_times(answers),
@@ -83,6 +88,12 @@ def _make_record(
         cases=tuple(cases),
         machines=tuple(folder.graph.machines()),
     )
+
+
+def digest_answers(answers: Sequence[Answer]) -> str:
+    """Digest of what was answered for every target: pose and score, or none. How it came about does not count."""
+    records = [answer_to_record(answer) for answer in answers]
+    return digest([{name: record.get(name) for name in _ANSWER_FIELDS} for record in records])
 
 
 def _now() -> str:

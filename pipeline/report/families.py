@@ -28,6 +28,11 @@ class Family:
     values: tuple[Any, ...]
 
     @property
+    def is_flat(self) -> bool:
+        """Whether all runs gave the same answers: the axis changes nothing. False for records of earlier versions."""
+        return len(self.runs) > 1 and len({run.answers for run in self.runs}) == 1 and bool(self.base.answers)
+
+    @property
     def numeric(self) -> bool:
         """Whether the values are numbers, and so can be placed on a line."""
         return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in self.values)

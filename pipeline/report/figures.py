@@ -1,6 +1,6 @@
 """Run records -> figures. Measured results are solid and filled; published ones are grey, dashed and hollow.
 
-Published curves have axes of their own; only the bars of single objects share axes with measured ones.
+Published results have axes of their own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pipeline.items.scores import Scores
 from pipeline.metrics.recall import MSPD_PX, THETAS, recall_by_threshold, recall_by_visibility
 from pipeline.report import published
 from pipeline.report.families import Family
-from pipeline.report.names import AXIS_TITLES, value_text
+from pipeline.report.names import AXIS_TITLES, detections_text, value_text
 from pipeline.report.plotting import (
     COLOURS,
     GREY,
@@ -39,9 +39,9 @@ _STAGE_COLOURS = (*COLOURS, GREY, "#b8bcc4", "#6b4c9a")
 
 @mpl.rc_context(STYLE)
 def objects_figures(runs: Mapping[str, RunRecord], dataset: str) -> list[Figure]:
-    """Bars of recall by object, a few objects per figure; the paper's bars are added on its own datasets."""
+    """Bars of recall by object, a few objects per figure; on the paper's datasets its bars are below."""
     objects = np.unique(_first_scores(runs).obj_id)
-    bars = len(runs) + len(published.OBJECTS.get(dataset, {}))
+    bars = max(len(runs), len(published.OBJECTS.get(dataset, {})))
     parts = np.array_split(objects, -(-len(objects) * bars // MAX_BARS)) if len(objects) else [objects]
     return [_objects_figure(runs, dataset, part.tolist()) for part in parts if len(part) or len(parts) == 1]
 
@@ -66,24 +66,40 @@ class _BarGroups:
 
 
 def _objects_figure(runs: Mapping[str, RunRecord], dataset: str, objects: Sequence[int]) -> Figure:
-    first, theirs = _first_scores(runs), published.OBJECTS.get(dataset, {})
-    canvas, axes = one_panel()
-    groups = _BarGroups(len(objects), len(runs) + len(theirs))
+    first, theirs = _first_scores(runs), published.OBJECTS.get(dataset)
+    if theirs:
+        canvas, (axes, below) = two_panels()
+        _draw_published_bars(below, theirs, objects, dataset)
+    else:
+        canvas, axes = one_panel()
+    groups = _BarGroups(len(objects), len(runs))
     for k, (name, run) in enumerate(runs.items()):
         scores, x = run.require_scores(), groups.positions(k)
         intervals = [ar_interval(scores.select(scores.obj_id == obj_id)) for obj_id in objects]
         means = [i.mean for i in intervals]
         axes.bar(x, means, groups.width, color=COLOURS[k % len(COLOURS)], label=wrap_name(name))
         axes.errorbar(x, means, error_bars(intervals), fmt="none", ecolor="#40464f", elinewidth=0.8)
-    for k, (name, values) in enumerate(theirs.items(), start=len(runs)):
-        heights = [values.get(obj_id, np.nan) for obj_id in objects]
-        style: dict[str, Any] = {"fill": False, "edgecolor": GREY, "linestyle": "--"}
-        axes.bar(groups.positions(k), heights, groups.width, label=f"{name}, published AR", **style)
     axes.set_xticks(range(len(objects)), [str(obj_id) for obj_id in objects])
-    axes.set(xlabel="object", ylabel=_ar_label(first), ylim=(0, 1.02))
+    axes.set(xlabel="" if theirs else "object", ylabel=_ar_label(first), ylim=(0, 1.02))
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, columnspacing=1.2, handlelength=1.4, borderpad=0)
     which = f"objects {objects[0]} to {objects[-1]}" if len(objects) > 1 else "object"
-    return Figure("objects", f"{ar_name(first)}, {which}, with 95 % intervals over images.", canvas)
+    caption = f"{ar_name(first)}, {which}, with 95 % intervals over images, on {detections_text(runs.values())}."
+    if theirs:
+        caption += " Below, the paper's bars on axes of their own: their mean is not its AR."
+    return Figure("objects", caption, canvas)
+
+
+def _draw_published_bars(
+    axes: Axes, theirs: Mapping[str, Mapping[int, float]], objects: Sequence[int], dataset: str
+) -> None:
+    groups = _BarGroups(len(objects), len(theirs))
+    styles: list[dict[str, Any]] = [{"fill": False, "linestyle": "--"}, {"color": "#e9ebee", "linestyle": "--"}]
+    for k, (name, values) in enumerate(theirs.items()):
+        heights = [values.get(obj_id, np.nan) for obj_id in objects]
+        axes.bar(groups.positions(k), heights, groups.width, edgecolor=GREY, label=name, **styles[k % 2])
+    axes.set(xlabel="object", ylabel="the paper's bars", ylim=(0, 1.02))
+    axes.set_title(f"published, {published.DATASETS[dataset]}; not AR", color=GREY)
+    add_legend(axes)
 
 
 @mpl.rc_context(STYLE)
@@ -104,7 +120,8 @@ def theta_figure(runs: Mapping[str, RunRecord], dataset: str) -> Figure:
     below.set(xlabel="upper bound of theta", ylabel="AR", ylim=(0, None))
     below.set_title(f"published, {published.DATASETS[shown]}", color=GREY)
     add_legend(below)
-    return Figure("theta", "Recall if only thresholds up to a bound count; the paper's curves below.", canvas)
+    caption = f"Recall if only thresholds up to a bound count, on {detections_text(runs.values())}; "
+    return Figure("theta", caption + "the paper's curves below.", canvas)
 
 
 @mpl.rc_context(STYLE)
@@ -154,7 +171,13 @@ def family_figure(family: Family) -> Figure:
     _plot_family(axes, family)
     lowest.set_xlabel(title)
     name = "ablation_" + family.axis.replace(".", "_")
-    return Figure(name, f"{title}: {len(family.runs)} runs that differ only in {family.axis}.", canvas)
+    caption = f"{title}: {len(family.runs)} runs that differ only in {family.axis}, "
+    caption += f"on {detections_text(family.runs)}."
+    if family.is_flat:
+        caption += " All gave the same poses and scores."
+    if theirs:
+        caption += " The paper's curve, on ground-truth boxes, is below."
+    return Figure(name, caption, canvas)
 
 
 def _plot_family(axes: Axes, family: Family) -> None:

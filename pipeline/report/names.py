@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from pipeline.report.families import difference, settings
@@ -46,6 +47,19 @@ def run_name(run: RunRecord, base: RunRecord) -> str:
     if theta_max != 0.5:
         parts.append(f"theta_max={theta_max:g}")
     return " ".join([*(method if parts else [run.method]), *parts])
+
+
+def detections_text(runs: Iterable[RunRecord]) -> str:
+    """What the runs' detections are, each kind once, with the mark of an oracle where they are ground truth."""
+    return "; ".join(dict.fromkeys(map(_detections_of, runs)))
+
+
+def _detections_of(run: RunRecord) -> str:
+    if run.detections:
+        return run.detections
+    variant = str((run.config.get("detect") or {}).get("_target_", "unknown detections")).rsplit(".", 2)
+    name = variant[-2] if len(variant) > 1 else variant[0]
+    return f"{name} (oracle)" if name.startswith("gt_") else name  # a record of an earlier version
 
 
 def value_text(value: Any) -> str:

@@ -20,7 +20,7 @@ from pipeline.errors import DzopError
 from pipeline.io.files import write_atomic, write_error
 from pipeline.report.embedded_pictures import GalleryPicture, PictureEmbedder
 from pipeline.report.plotting import Figure
-from pipeline.report.published_tables import published_methods_of, published_tables
+from pipeline.report.published_tables import published_methods_of, published_notes, published_tables
 from pipeline.report.reproduction import reproduction_tables
 from pipeline.report.run_records import RunRecord, unresolved_failures
 from pipeline.report.section import Section, sections_of
@@ -111,6 +111,7 @@ def _write_all(
         failed=failed,
         published=published_tables(),
         reproduced=reproduced,
+        published_notes=published_notes(),
         runs=sum(run.status == "done" for run in runs) + len(failed),
         skipped_pictures=embedder.skipped,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

@@ -53,10 +53,11 @@ class Case:
 class RunRecord:
     """Results of one run, or why it failed.
 
-    ``config``: the resolved configuration. ``label``: the variant of every stage. ``counts``: by step, how many items
-    were computed and reused, and seconds. ``times_s``: by stage, median seconds of a target. ``failures``: (stage,
-    reason, count) of targets without a pose. ``templates``: errors of the matched templates by (scene_id, im_id,
-    obj_id, gt_id). ``metrics``: average recalls and other summary figures. ``folder``: where csv, poses.json and
+    ``config``: the resolved configuration. ``label``: the variant of every stage. ``detections``: what the detections
+    are, and ``answers``: digest of poses and scores; both "" in records of earlier versions. ``counts``: by step, how
+    many items were computed and reused, and seconds. ``times_s``: by stage, median seconds of a target. ``failures``:
+    (stage, reason, count) of targets without a pose. ``templates``: errors of the matched templates by (scene_id,
+    im_id, obj_id, gt_id). ``metrics``: average recalls and other summary figures. ``folder``: where csv, poses.json and
     pictures are, relative to ``out``. ``machines``: what computed the entries it used, one line each. A failed run has
     ``error`` and its command-line ``overrides``, and defaults for everything it did not reach.
     """
@@ -71,10 +72,12 @@ class RunRecord:
     overrides: tuple[str, ...] = ()
     sweep: str = ""
     notice: str = ""
+    detections: str = ""
     dataset: DatasetId | None = None
     run: str = ""
     folder: str = ""
     csv: str = ""
+    answers: str = ""
     estimates: int = 0
     counts: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     times_s: Mapping[str, float] = field(default_factory=dict)
@@ -181,7 +184,20 @@ def _to_json(record: RunRecord) -> dict[str, Any]:
     return content
 
 
-_TEXT_FIELDS = ("id", "status", "at", "method", "error", "sweep", "notice", "run", "folder", "csv")
+_TEXT_FIELDS = (
+    "id",
+    "status",
+    "at",
+    "method",
+    "error",
+    "sweep",
+    "notice",
+    "detections",
+    "answers",
+    "run",
+    "folder",
+    "csv",
+)
 _OBJECT_FIELDS = ("config", "label", "counts", "times_s", "metrics")
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 from pipeline.report import figures, tables, variation_tables
 from pipeline.report.families import Family, base_of, families, is_oracle, scoring_settings
-from pipeline.report.names import run_name
+from pipeline.report.names import detections_text, run_name
 from pipeline.report.plotting import Figure
 from pipeline.report.run_records import RunRecord
 from pipeline.report.run_statistics import ar_interval, ar_name, same_metric
@@ -107,7 +107,18 @@ class Section:
         """The best run and its recall."""
         interval = ar_interval(self.best.require_scores())
         spread = f"95 % over images: {interval.low:.3f} to {interval.high:.3f}"
-        return f"{self.metric} {interval.mean:.3f} ({spread}) by {self.name(self.best)}"
+        on = detections_text([self.best])
+        return f"{self.metric} {interval.mean:.3f} ({spread}) by {self.name(self.best)} on {on}"
+
+    @property
+    def detections(self) -> str:
+        """What the detections of the runs are, with the mark of an oracle where they are ground truth."""
+        return detections_text(self.runs)
+
+    @property
+    def flat(self) -> list[str]:
+        """Notes on ablations whose setting changed no answer."""
+        return [tables.flat_text(family) for family in self.families if family.is_flat]
 
     def figures(self) -> dict[str, list[Figure]]:
         """Figures by part of the page."""

@@ -11,7 +11,7 @@ from pipeline.metrics.bootstrap import Interval
 from pipeline.metrics.recall import instance_recalls
 from pipeline.progress import format_bytes
 from pipeline.report.families import Family
-from pipeline.report.names import run_name, value_text
+from pipeline.report.names import detections_text, run_name, value_text
 from pipeline.report.run_records import RunRecord
 from pipeline.report.run_statistics import acc15, ar_column, ar_interval, paired_difference, template_angles_deg
 from pipeline.report.table import NOT_AVAILABLE, Table
@@ -24,9 +24,10 @@ def runs_table(runs: Sequence[RunRecord], base: RunRecord) -> Table:
     """Every finished run, best first, with its paired difference from the base run."""
     ordered = sorted(runs, key=lambda run: -ar_interval(run.require_scores()).mean)
     recall = ar_column(base.require_scores())
-    head = ("run", recall, "vs base", "AR_VSD", "AR_MSSD", "AR_MSPD", "Acc15", "template error", "poses", "s/target",
-            "cache/object")  # fmt: skip
-    caption = "Runs. Acc15 and template error: geodesic. *: significant at 95 %, paired over images."
+    head = ("run", "detections", recall, "vs base", "AR_VSD", "AR_MSSD", "AR_MSPD", "Acc15", "template error", "poses",
+            "s/target", "cache/object")  # fmt: skip
+    caption = f"Runs on {detections_text(ordered)}. "
+    caption += "Acc15 and template error: geodesic. *: significant at 95 %, paired over images."
     if base.require_scores().vsd is None:
         caption += " AR_MSSD+MSPD is the mean of the two, not BOP's AR: VSD is not available."
     return Table("runs", caption, "measured", head, tuple(_run_row(run, base) for run in ordered))
@@ -38,6 +39,7 @@ def _run_row(run: RunRecord, base: RunRecord) -> tuple[str, ...]:
     angles = template_angles_deg(run, "geodesic")
     return (
         run_name(run, base),
+        detections_text([run]),
         _recall_cell(run, base),
         "base" if run.id == base.id else signed_text(paired_difference(run, base)),
         *map(number_text, recalls),
@@ -82,7 +84,15 @@ def family_table(family: Family) -> Table:
     ]
     name = "ablation_" + family.axis.replace(".", "_")
     head = (family.axis, ar_column(family.base.require_scores()), "95 %", "vs base, paired")
-    return Table(name, f"Runs that differ only in {family.axis}.", "measured", head, tuple(rows))
+    caption = f"Runs that differ only in {family.axis}, on {detections_text(family.runs)}."
+    if family.is_flat:
+        caption += f" {flat_text(family)}"
+    return Table(name, caption, "measured", head, tuple(rows))
+
+
+def flat_text(family: Family) -> str:
+    """A note that the swept setting changed no answer."""
+    return f"{family.axis} changed no answer: all {len(family.runs)} runs gave the same poses and scores."
 
 
 def improvement_table(methods: Sequence[tuple[str, RunRecord]]) -> Table | None:
@@ -105,7 +115,8 @@ def improvement_table(methods: Sequence[tuple[str, RunRecord]]) -> Table | None:
         )
     recall = ar_column(ours.require_scores())
     head = ("methods", "pose error", "Acc15", recall, f"{recall} difference, paired")
-    caption = "Relative improvement; pose error is the mean geodesic angle of the matched template."
+    caption = f"Relative improvement on {detections_text(run for _, run in methods)}; "
+    caption += "pose error is the mean geodesic angle of the matched template."
     return Table("improvement", caption, "measured", head, tuple(rows))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipeline.report.families import difference, is_oracle, settings
+from pipeline.report.names import detections_text
 from pipeline.report.run_records import RunRecord
 from pipeline.report.run_statistics import ar_column, paired_difference, same_metric
 from pipeline.report.table import Table
@@ -34,7 +35,8 @@ def correspondence_table(runs: Sequence[RunRecord]) -> Table | None:
             rows.append((*("yes" if on else "no" for on in parts), *recall_cells(run), seconds))
     recall = ar_column(next(iter(by_name.values())).require_scores())
     head = ("co-projection", "clusters", "sub-pixel", recall, "95 %", "s/target")
-    return Table("correspondence", "Correspondence estimation.", "measured", head, tuple(rows))
+    caption = f"Correspondence estimation on {detections_text(by_name.values())}."
+    return Table("correspondence", caption, "measured", head, tuple(rows))
 
 
 def ladder_table(runs: Sequence[RunRecord]) -> Table | None:
@@ -49,7 +51,8 @@ def ladder_table(runs: Sequence[RunRecord]) -> Table | None:
         rows.append((title, *recall_cells(run), gain))
         before = run
     head = ("ground truth", ar_column(shown[0][1].require_scores()), "95 %", "gain, paired")
-    caption = "Oracle ladder: recall as parts of the pipeline are replaced by ground truth."
+    caption = "Oracle ladder: recall as parts of the pipeline are replaced by ground truth. "
+    caption += f"The first line is on {detections_text([shown[0][1]])}."
     return Table("ladder", caption, "measured", head, tuple(rows))
 
 

@@ -17,6 +17,7 @@ from pipeline.embedded.surfaces import imitate_scan
 from pipeline.embedded.training import iterate_batches, train
 from pipeline.embedded.training_stages import Autoencoder, Denoiser, Descriptors
 from pipeline.embedded.views import CLUSTERS_PER_OBJECT
+from pipeline.stages.extract.embedded import digest_weights
 
 PLAN = TrainingPlan(shards=1, autoencoder=3, denoiser=2, descriptors=2, easy=1, pictures=4, noises=2, objects=1)
 
@@ -151,7 +152,10 @@ def test_every_stage_starts_from_the_one_before_and_all_are_exported(folder, tmp
         "unet_pure.safetensors",
         "unet_learned.safetensors",
         "head.safetensors",
+        "head.json",
     }
+    trained_on = json.loads((tmp_path / "weights" / "head.json").read_text())
+    assert trained_on["weights"] == f"learned {digest_weights(tmp_path / 'weights', 'learned')}"
     assert size < 25_000_000
     curves = json.loads((tmp_path / "weights" / "losses.json").read_text())
     assert [record["step"] for record in curves["denoiser"]] == [0, 1]

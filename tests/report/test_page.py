@@ -234,3 +234,48 @@ def test_a_full_disk_leaves_the_report_that_was_there(runs, tmp_path, monkeypatc
         assert {path.parent.name for path in now} >= {"report", "figures", "tables"} & {p.parent.name for p in before}
         assert not [path for path in tmp_path.rglob("*") if path.name.endswith(".partial")]
         assert now == before or number > last_file + 3, writes[number - 1]
+
+
+def test_a_page_of_ground_truth_masks_says_so_wherever_figures_stand(tmp_path):
+    text = page([toy_run(0.5, name="lmo"), toy_run(0.3, name="lmo", at=1, cluster__count=40)], tmp_path)
+    assert text.count("ground-truth masks (oracle)") >= 6
+    best = re.search(r'<p class="best">.*?</p>', text)[0]
+    runs_caption, published_caption = (
+        re.search(rf"<figcaption>{start}.*?</figcaption>", text)[0]
+        for start in ("Runs on", "AR of single-shot methods on")
+    )
+    above_published = text[text.index(published_caption) - 400 : text.index(published_caption)]
+    for place in (best, runs_caption, above_published):
+        assert "ground-truth masks (oracle)" in place
+    for words in ("thresholds up to a bound", "objects 1 to 3", "differ only in cluster.count"):
+        assert re.search(rf"<figcaption>[^<]*{words}[^<]*\(oracle\)[^<]*</figcaption>", text)
+
+
+@pytest.mark.parametrize(
+    ("detect", "detections", "shown"),
+    [
+        ("gt_bbox.GtBbox", "ground-truth boxes (oracle)", "ground-truth boxes (oracle)"),
+        ("json.Json", "detections of cnos.json", "detections of cnos.json"),
+        ("gt_mask.GtMask", "", "gt_mask (oracle)"),
+        ("cnos.Cnos", "", "cnos"),
+    ],
+)
+def test_detections_are_named_also_for_records_of_earlier_versions(tmp_path, detect, detections, shown):
+    config = {"_target_": f"pipeline.stages.detect.{detect}"}
+    text = page([replace(toy_run(0.5, detect=config), detections=detections)], tmp_path)
+    assert f"<p>Detections: <b>{shown}</b>." in text
+    assert ("Ground truth tells the method" in text) == ("(oracle)" in shown)
+
+
+def test_an_ablation_that_changed_no_answer_says_so(tmp_path):
+    flat = [toy_run(0.5), *(toy_run(0.5, at=n, correspond__per_cluster=n) for n in (1, 5, 30))]
+    note = "correspond.per_cluster changed no answer: all 4 runs gave the same poses and scores."
+    assert note in page(flat, tmp_path / "flat")
+    assert note not in page([*flat[:-1], replace(flat[-1], answers="others")], tmp_path / "moves")
+    assert note not in page([replace(run, answers="") for run in flat], tmp_path / "old")
+
+
+def test_the_page_says_that_the_papers_bars_are_not_its_ar(built):
+    _, text = built
+    assert "their means are 0.468 on LM-O (AR 0.328), 0.776 on YCB-V (AR 0.365), 0.474 on T-LESS (AR 0.267)" in text
+    assert "0.433 in the table of correspondence estimation, 0.4433 in its ablations" in text

@@ -66,6 +66,8 @@ def toy_run(level: float = 0.5, *, at: int = 0, key: str = "k" * 64, method: str
         method=method,
         config=config,
         sweep="toy" if changes else "",
+        detections="ground-truth masks (oracle)",
+        answers=f"answers {level}",
         label={"extract": "hog", "match": config["match"]["_target_"].split(".")[-2]},
         dataset=DatasetId(name, "test", key, instances, (instances + 2) // 3, (1, 2, 3)),
         run=run_id({k: v for k, v in config.items() if k != "evaluate"} | {"of": f"{key} {method} {level}"}),

@@ -8,15 +8,16 @@ import pytest
 import torch
 
 from pipeline.backbones.batching import maps_bytes
+from pipeline.embedded.export import describe_features
 from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES
 from pipeline.items.features import CropFeatures
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
-from pipeline.stages.extract.embedded import Embedded
+from pipeline.stages.extract.embedded import FOLDER, Embedded
 from pipeline.stages.fuse.auto import Auto
-from pipeline.stages.fuse.learned import Learned
+from pipeline.stages.fuse.learned import TRAINED_ON, Learned
 from pipeline.stages.fuse.pca import Pca
 
 LAYERS = (2, 5, 8, 11)
@@ -108,16 +109,33 @@ def test_the_weight_of_edges_enters_the_key_only_where_edges_are_used():
 
 
 def test_the_head_refuses_features_it_was_not_trained_on():
-    Learned().check(Embedded().model)
+    Learned().check(Embedded())
+    Learned().check(Embedded(dtype="float16", seed=3))
     with pytest.raises(BadInput, match=r"features of embedded-pure-.* needs extract=embedded extract.weights=learned"):
-        Learned().check(Embedded(weights="pure").model)
+        Learned().check(Embedded(weights="pure"))
     with pytest.raises(BadInput, match=r"fuse.layers: found \[2, 5\], needs \[2, 5, 8, 11, 12\]"):
-        Learned(layers=(2, 5)).check(Embedded().model)
+        Learned(layers=(2, 5)).check(Embedded())
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "trained"),
+    [("hook", "post", "'pre'"), ("timestep", 100, "50"), ("noise", "shared", "'none'"), ("input_size", 256, "128")],
+)
+def test_the_head_refuses_features_made_otherwise_than_it_was_trained(field, value, trained):
+    said = rf"extract\.{field}: found {value!r}, needs {trained}, as the head of fuse=learned was trained; or fuse=pca"
+    with pytest.raises(BadInput, match=said):
+        Learned().check(Embedded(**{field: value}))
+    with pytest.raises(BadInput, match=said):
+        Auto().resolve_for(Embedded().model).check(Embedded(**{field: value}))
+
+
+def test_the_head_ships_with_what_it_was_trained_on():
+    assert json.loads(TRAINED_ON.read_text()) == describe_features(FOLDER)
 
 
 def test_auto_uses_the_head_trained_for_the_features():
     assert Auto().resolve_for(Embedded().model) == Learned()
     with pytest.raises(BadInput, match=r"fuse.layers: found \[5, 8\]"):
-        Auto(layers=(5, 8)).resolve_for(Embedded().model).check(Embedded().model)
+        Auto(layers=(5, 8)).resolve_for(Embedded().model).check(Embedded())
     assert Auto(layers=(5, 8)).resolve_for(Embedded(weights="pure").model) == Pca(layers=(5, 8))
     assert Auto().resolve_for("hog") == Pca()

@@ -47,6 +47,11 @@ class Detector(Spec, ABC):
     """Contract of a detect variant, which reads its detections from files or compares descriptors."""
 
     @property
+    def summary(self) -> str:
+        """What the detections are, for headlines and reports; ground truth is marked "(oracle)"."""
+        return f"detections of {self.kind.partition('.')[2]}"
+
+    @property
     def describer(self) -> Describer | None:
         """What to describe proposals and templates by: the graph computes descriptors and passes them to the call."""
         return None

@@ -49,6 +49,11 @@ class Cnos(Detector):
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
 
     @property
+    def summary(self) -> str:
+        """As Detector.summary."""
+        return "masks by CNOS"
+
+    @property
     def describer(self) -> Describer:
         """``describe``, ``describe_layer`` and ``proposals``."""
         return Describer(self.proposals, self.describe, self.describe_layer)

@@ -29,6 +29,11 @@ class GtBbox(Detector):
 
     bbox: Literal["visib", "obj"] = "visib"
 
+    @property
+    def summary(self) -> str:
+        """As Detector.summary."""
+        return f"ground-truth boxes{'' if self.bbox == 'visib' else ' of silhouettes'} (oracle)"
+
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """Annotations of the scenes."""
         return annotation_paths(dataset, targets)

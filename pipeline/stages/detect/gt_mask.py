@@ -31,6 +31,11 @@ class GtMask(Detector):
 
     visible: bool = True
 
+    @property
+    def summary(self) -> str:
+        """As Detector.summary."""
+        return "ground-truth masks (oracle)" if self.visible else "ground-truth silhouettes (oracle)"
+
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """Annotations of the scenes, the images (for their size), and the masks that exist.
 

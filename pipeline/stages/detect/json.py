@@ -42,6 +42,11 @@ class Json(Detector):
     path: str = ""
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
 
+    @property
+    def summary(self) -> str:
+        """As Detector.summary, with the file's name."""
+        return f"detections of {Path(self.path).name}"
+
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the file's digest instead of its path."""
         return super().recipe() | {"path": file_digest(self._file())}

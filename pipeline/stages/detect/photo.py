@@ -23,6 +23,11 @@ class PhotoMask(Detector):
     kind: ClassVar[str] = "detect.photo"
     version: ClassVar[int] = 2
 
+    @property
+    def summary(self) -> str:
+        """As Detector.summary."""
+        return "the mask or box of dataset=photo"
+
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:
         """The photograph, and its mask file if given."""
         photo = _require_photo(dataset)

@@ -107,11 +107,7 @@ class Embedded(DiffusionFeatures):
     @cached_property
     def weights_digest(self) -> str:
         """sha256 of configs and weights. Raises BadInput for a file that is missing."""
-        paths = [FOLDER / name for name in ("config.json", f"unet_{self.weights}.safetensors", "vae.safetensors")]
-        for path in paths:
-            if not path.exists():
-                raise BadInput(path, found="nothing", needed="the embedded model's weights (make train-embedded)")
-        return digest([file_digest(path) for path in paths])
+        return digest_weights(FOLDER, self.weights)
 
 
 class EmbeddedBackbone(DiffusionBackbone):
@@ -133,6 +129,15 @@ class EmbeddedBackbone(DiffusionBackbone):
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (crops.rgb, crops.mask))
         edges = edge_histograms(rgb, mask, cells=self.spec.feature_shape(EDGES)[1])
         return edges.to(getattr(torch, self.spec.dtype))
+
+
+def digest_weights(folder: Path, weights: WeightSet) -> str:
+    """sha256 of configs and weights in a folder. Raises BadInput for a file that is missing."""
+    paths = [folder / name for name in ("config.json", f"unet_{weights}.safetensors", "vae.safetensors")]
+    for path in paths:
+        if not path.exists():
+            raise BadInput(path, found="nothing", needed="the embedded model's weights (make train-embedded)")
+    return digest([file_digest(path) for path in paths])
 
 
 def _decoder_layers(layers: Sequence[int]) -> list[int]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
+from pipeline.backbones.extractor import Extractor
 from pipeline.errors import NoPose
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.items.features import CropFeatures, FittedArrays, FusedPair
@@ -46,8 +47,8 @@ class Fuser(Spec, ABC, Generic[Encoded]):
         """What is fitted to the object's templates offline."""
         return None
 
-    def check(self, model: str) -> None:
-        """Raise BadInput where the variant was trained on features of another model than the extractor's ``model``."""
+    def check(self, extract: Extractor) -> None:
+        """Raise BadInput where the variant was trained on features made otherwise than by this extractor."""
         return
 
     @abstractmethod

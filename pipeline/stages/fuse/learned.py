@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 
 import torch
 
+from pipeline.backbones.extractor import Extractor
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
 from pipeline.functional.gradients import EDGES, append_edges
 from pipeline.functional.masks import cell_mask
+from pipeline.io.checkpoints import read_json
 from pipeline.io.digests import FileChanged, file_digest
 from pipeline.io.files import read_file
 from pipeline.items.features import CropFeatures, FittedArrays, FusedPair
@@ -22,6 +24,8 @@ from pipeline.stages.fuse import EncodedMap, Fuser, Layers, pair_encoded
 LAYERS = (2, 5, 8, 11)
 WITH_EDGES = (*LAYERS, EDGES)
 HEAD = Path(__file__).parents[2] / "embedded" / "weights" / "head.safetensors"
+TRAINED_ON = HEAD.with_suffix(".json")
+"""Recipe of the extractor that the head was trained on, without version and dtype, which may differ."""
 
 
 @spec
@@ -30,7 +34,8 @@ class Learned(Fuser[EncodedMap]):
 
     Layer 12, the crop's own gradient histograms, is appended with the weight ``edges``: descriptors distinguish
     places, edges localise them. Without 12 among the ``layers`` the descriptors are used alone. Works only with the
-    features it was trained on: ``extract=embedded extract.weights=learned``.
+    features it was trained on: ``extract=embedded extract.weights=learned`` with its hook, timestep, noise and input
+    size.
     """
 
     kind: ClassVar[str] = "fuse.learned"
@@ -44,11 +49,16 @@ class Learned(Fuser[EncodedMap]):
         """Whether the head was trained on the features of an extractor's ``model``."""
         return model.startswith("embedded-learned-")
 
-    def check(self, model: str) -> None:
+    def check(self, extract: Extractor) -> None:
         """Raise BadInput for features that the head was not trained on, and for a subset of their layers."""
-        if not self.suits(model):
+        if not self.suits(extract.model):
             needed = "extract=embedded extract.weights=learned, or fuse=auto or pca for other features"
-            raise BadInput("fuse=learned", found=f"features of {model}", needed=needed)
+            raise BadInput("fuse=learned", found=f"features of {extract.model}", needed=needed)
+        recipe = extract.recipe()
+        for name, value in _read_trained_on().items():
+            if recipe.get(name) != value:
+                needed = f"{value!r}, as the head of fuse=learned was trained; or fuse=pca, as in method=dzop"
+                raise BadInput(f"extract.{name}", found=repr(recipe.get(name)), needed=needed)
         if self.layers not in (LAYERS, WITH_EDGES):
             needed = f"{list(WITH_EDGES)} for fuse=learned, or {list(LAYERS)} without edges"
             raise BadInput("fuse.layers", found=list(self.layers), needed=needed)
@@ -93,6 +103,12 @@ def _head(device: torch.device, weights_digest: str) -> Aggregation:
     return head.eval().requires_grad_(False).to(device)
 
 
+def _read_trained_on() -> dict[str, Any]:
+    _require_head()
+    return read_json(TRAINED_ON)
+
+
 def _require_head() -> None:
-    if not HEAD.exists():
-        raise BadInput(HEAD, found="nothing", needed="the embedded model's head (make train-embedded), or fuse=pca")
+    for path in (HEAD, TRAINED_ON):
+        if not path.exists():
+            raise BadInput(path, found="nothing", needed="the embedded model's head (make train-embedded), or fuse=pca")

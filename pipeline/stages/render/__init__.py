@@ -17,6 +17,10 @@ class Renderer(Spec, ABC):
     rgb is black where depth is 0. Depth is in float32 mm along the optical axis. Pixel centres are integers.
     """
 
+    def count_views(self) -> int | None:
+        """Number of templates of every object; None where it depends on the mesh."""
+        return None
+
     @abstractmethod
     def cameras(self, mesh: Mesh) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 4 4"], tuple[int, int]]:
         """K, T_cam_obj of all templates, and the image size (h, w); every camera sees the whole mesh."""

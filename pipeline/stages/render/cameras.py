@@ -30,6 +30,10 @@ class RenderSpec(Renderer):
     diffuse: Fraction = 0.55
     crease_deg: Annotated[float, Field(ge=0, le=180)] = 40.0
 
+    def count_views(self) -> int:
+        """As Renderer.count_views."""
+        return len(viewpoint_rotations(self.viewpoints, self.count, self.inplane))
+
     def cameras(self, mesh: Mesh) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 4 4"], tuple[int, int]]:
         """K, T_cam_obj of all templates, and the image size (h, w).
 
