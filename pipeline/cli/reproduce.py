@@ -25,7 +25,7 @@ Diffusion, and write one page with published and measured results. Run again to 
   plan=true          print jobs, images through the backbone, bytes and GPU hours; download and compute nothing
   datasets=[lmo]     some of lmo, ycbv, tless; the ablations belong to lmo
   images=20          at most so many images of each dataset, evenly spaced
-  method=dzop_sd     the method in the paper's place
+  method=dzop_paper  the method in the paper's place
   baselines=[zs6d]   further methods on the same masks (zs6d needs 43 MB of cache per image)
   data=data          folder of the datasets; what is there is not fetched
   detections=detections/cnos-fastsam.json   a detector's file, in each dataset's folder

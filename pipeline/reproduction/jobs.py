@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.fetch.dataset import DETECTIONS
 
-METHOD = "dzop_sd"
+METHOD = "dzop_paper"
 EXTRACT = "stable_diffusion"
 ABLATED = "lmo"  # the dataset of the paper's ablations, which use its ground-truth boxes
 TIMESTEPS = 10  # of the sweep of that name; 50, one of them, is the default
