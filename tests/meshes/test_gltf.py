@@ -99,6 +99,39 @@ def test_texture_transform_is_applied(name, path):
     assert_corner_colours(read_mesh(gltf.write(path)), CORNER_COLOURS)
 
 
+HALF_TURN = float(np.pi / 2)
+WORKED = {  # stated transform, stored (u, v), where the texture is looked up; v downwards, worked out by hand
+    # the specification's first example: the lower left quarter of the image, rotated clockwise by 90 degrees
+    "upper left": ({"offset": [0, 1], "rotation": HALF_TURN, "scale": [0.5, 0.5]}, (0, 0), (0, 1)),
+    "upper right": ({"offset": [0, 1], "rotation": HALF_TURN, "scale": [0.5, 0.5]}, (1, 0), (0, 0.5)),
+    "lower right": ({"offset": [0, 1], "rotation": HALF_TURN, "scale": [0.5, 0.5]}, (1, 1), (0.5, 0.5)),
+    "lower left": ({"offset": [0, 1], "rotation": HALF_TURN, "scale": [0.5, 0.5]}, (0, 1), (0.5, 1)),
+    # its second example turns the vertical axis over
+    "flip": ({"offset": [0, 1], "scale": [1, -1]}, (0.25, 0.75), (0.25, 0.25)),
+    # translation * rotation * scale: (0.3, 0.4) is scaled to (0.6, 0.2), turned to (0.2, -0.6), moved
+    "order": ({"offset": [0.1, 0.2], "rotation": HALF_TURN, "scale": [2, 0.5]}, (0.3, 0.4), (0.3, -0.4)),
+    # counter-clockwise where v points down: from the right upwards
+    "sense": ({"rotation": float(np.pi / 6)}, (1, 0), (3**0.5 / 2, -0.5)),
+}
+
+
+@pytest.mark.parametrize("coordinate_set", [0, 1])
+@pytest.mark.parametrize("name", WORKED)
+def test_texture_transform_gives_the_numbers_of_its_specification(name, coordinate_set, path):
+    """Khronos, KHR_texture_transform; its matrix's sign as corrected in github.com/KhronosGroup/glTF/issues/1563."""
+    stated, stored, expected = WORKED[name]
+    gltf = Gltf()
+    attributes = {"POSITION": gltf.positions(SQUARE.astype(np.float32))}
+    attributes["TEXCOORD_0"] = gltf.accessor(np.full((4, 2), 0.9, np.float32))
+    attributes[f"TEXCOORD_{coordinate_set}"] = gltf.accessor(np.tile(stored, (4, 1)).astype(np.float32))
+    # the extension's texCoord replaces that of the texture's reference
+    override = {"texCoord": coordinate_set} if coordinate_set else {}
+    info = {"texCoord": 0, "extensions": {"KHR_texture_transform": stated | override}}
+    gltf.primitive(attributes, material=gltf.material(texture(), info))
+    u, v = read_mesh(gltf.write(path)).uv.T
+    np.testing.assert_allclose(np.stack([u, 1 - v], axis=-1), np.tile(expected, (4, 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("with_material", [True, False])
 @pytest.mark.parametrize("width", [3, 4])
