@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.functional.arrays import rank_rows
+
 DEFAULT_GREY = 178  # grey level (0..255) of a mesh without colours
 
 
@@ -26,8 +28,7 @@ def corner_normals(
     split. ``crease_deg`` 0 gives flat shading, 180 smooth shading everywhere; a box needs less than 45.
     """
     flat = _normalize(face_normals(vertices, faces))
-    _, position = np.unique(vertices, axis=0, return_inverse=True)
-    corner = position.reshape(-1)[faces]
+    corner = rank_rows(list(vertices.T))[faces]
     weights = (corner_angles(vertices, faces)[..., None] * flat[:, None]).reshape(-1, 3)
     count = int(corner.max()) + 1
     smooth = np.stack([np.bincount(corner.reshape(-1), weights[:, axis], count) for axis in range(3)], axis=-1)

@@ -43,7 +43,8 @@ class _Lines:
 
     def count(self, marks: Bool[np.ndarray, " d"]) -> Int[np.ndarray, " n"]:
         """How many marked bytes each line has."""
-        return np.add.reduceat(marks, self.start, dtype=np.int64)
+        marked = np.flatnonzero(marks)
+        return np.diff(np.searchsorted(marked, self.start), append=len(marked))
 
     def text(self, rows: Int[np.ndarray, " m"], skip: int) -> bytes:
         """These lines, their first ``skip`` bytes blank."""
@@ -104,11 +105,18 @@ def parse_obj(path: Path, data: bytes, companions: Companions) -> Mesh:
 
 
 def _split_lines(data: bytes) -> _Lines:
+    """The lines without blanks before keywords and without comments after numbers."""
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b"  ") + b"\n"
-    if re.search(rb"^[ \t]+\S", data, flags=re.MULTILINE):
+    if data[:1] in b" \t" or b"\n " in data or b"\n\t" in data:
         data = re.sub(rb"^[ \t]+", b"", data, flags=re.MULTILINE)
-    if re.search(rb"^(?:v|vt|f)[ \t][^#\n]*#", data, flags=re.MULTILINE):
-        data = re.sub(rb"^((?:v|vt|f)[ \t][^#\n]*)#.*$", rb"\1", data, flags=re.MULTILINE)
+    lines = _locate_lines(data)
+    commented = np.searchsorted(lines.start, np.flatnonzero(lines.data == ord("#")), side="right") - 1
+    if np.isin(commented, np.concatenate([lines.select(word) for word in (b"v", b"vt", b"f")])).any():
+        lines = _locate_lines(re.sub(rb"^((?:v|vt|f)[ \t][^#\n]*)#.*$", rb"\1", data, flags=re.MULTILINE))
+    return lines
+
+
+def _locate_lines(data: bytes) -> _Lines:
     units = np.frombuffer(data, dtype=np.uint8)
     start = np.concatenate([[0], np.flatnonzero(units[:-1] == 10) + 1])
     kind = (units[start].astype(np.int64) << 8) + units[np.minimum(start + 1, len(units) - 1)]
