@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.extraction import extraction, extraction_sd
 from benchmarks.jobs import memory, onboarding, warm
 from benchmarks.measure import Measurement, describe_machine, table
+from benchmarks.meshes import meshes
 from benchmarks.online import online
 from benchmarks.rendering import rendering
 from benchmarks.storing import storing
@@ -32,15 +33,17 @@ PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "onboard": onboarding,
     "memory": memory,
     "extract-sd": extraction_sd,
+    "meshes": meshes,
 }
-ON_REQUEST = ("extract-sd",)  # measured only if named
+ON_REQUEST = ("extract-sd", "meshes")  # measured only if named
 
 
 def main() -> None:
     """Parse the options, measure, print and write the results."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     add, default = parser.add_argument, "(default: %(default)s)"
-    add("parts", nargs="*", help=f"parts to measure: {', '.join(PARTS)} (default: all except {ON_REQUEST[0]})")
+    others = ", ".join(ON_REQUEST)
+    add("parts", nargs="*", help=f"parts to measure: {', '.join(PARTS)} (default: all except {others})")
     add("--json", type=Path, default=Path("results/bench.json"), help=f"file for the measurements {default}")
     add("--device", default="cpu", help=f"cpu, cuda or cuda:N {default}")
     add("--repeats", type=int, default=7, help=f"repetitions; medians are reported {default}")

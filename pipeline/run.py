@@ -83,6 +83,7 @@ def _run_step(graph: Graph, options: Options) -> str:
     print(_headline(graph.context, options), flush=True)
     try:
         if options.step == "onboard":
+            _print_warnings(graph.mesh_warnings())
             graph.onboard()
         elif options.step == "detect":
             _detect(graph, options)
@@ -109,6 +110,7 @@ def _print_plan(graph: Graph, options: Options) -> None:
         print(_headline(graph.context, options), flush=True)
     except NotDownloaded as error:
         not_downloaded = error
+    _print_warnings(graph.mesh_warnings())
     try:
         for node in graph.plan():
             nodes.append(node)

@@ -35,6 +35,7 @@ MAX_INT = 2**31 - 1  # counts and seeds reach C code in numpy, torch and OpenCV 
 Positive = Annotated[int, Field(ge=1, le=MAX_INT)]
 NonNegative = Annotated[int, Field(ge=0, le=MAX_INT)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+FaceCount = Annotated[int, Field(ge=4, le=MAX_INT)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from pipeline.errors import BadInput
 from pipeline.functional.shading import texture_colour
-from pipeline.io.meshes import diameter_mm, mesh_digest, read_mesh, write_ply
+from pipeline.io.meshes import diameter_mm, identify_mesh, read_mesh, write_ply
 from pipeline.items.objects import Mesh
 
 # a unit square in two triangles; the texture has one colour per quarter
@@ -151,19 +151,19 @@ def test_digest_depends_on_contents_not_locations(tmp_path):
 def test_mesh_digest_equals_that_of_the_mesh_read(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
     trimesh.Trimesh(SQUARE, SQUARE_FACES, process=False).export(path)
-    assert mesh_digest(path) == read_mesh(path).digest
+    assert identify_mesh(path).digest == read_mesh(path).digest
 
 
 def test_digest_of_a_ply_includes_its_texture_without_parsing(tmp_path, monkeypatch):
     path = ply_with_vertex_uv(tmp_path)
     whole = read_mesh(path).digest
     monkeypatch.setattr("pipeline.io.meshes.read_mesh", None)
-    assert mesh_digest(path) == whole
+    assert identify_mesh(path).digest == whole
     Image.new("RGB", (8, 8)).save(tmp_path / "skin.png")
-    assert mesh_digest(path) != whole
+    assert identify_mesh(path).digest != whole
     (tmp_path / "skin.png").unlink()
     with pytest.raises(BadInput, match=r"skin\.png.*no such file"):
-        mesh_digest(path)
+        identify_mesh(path)
 
 
 def test_binary_ply_round_trip(tmp_path):

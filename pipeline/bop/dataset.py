@@ -17,16 +17,16 @@ from pipeline.bop.images import image_digest, image_size, read_depth, read_mask,
 from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
 from pipeline.bop.layout import check_folders, check_scene_folder, check_sensor_name, find_model
 from pipeline.bop.lens import describe_distortion
-from pipeline.bop.models import ModelInfo, check_model_files, read_model, read_models_info
+from pipeline.bop.models import ModelInfo, check_model_files, compare_diameters, read_model, read_models_info
 from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
 from pipeline.errors import BadInput
 from pipeline.functional.camera import project
 from pipeline.functional.rigid import transform
 from pipeline.io.digests import file_exists
-from pipeline.io.meshes import mesh_digest
-from pipeline.items.objects import ObjectModel
+from pipeline.io.meshes import prepared_digest
+from pipeline.items.objects import MeshFacts, ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.spec import spec
+from pipeline.spec import FaceCount, spec
 
 # Box diagonals. The largest offset over the targets of LM-O and YCB-V in the tests is 0.13; a K for an image of half
 # the size gives 0.9 or more.
@@ -40,6 +40,7 @@ class DatasetConfig:
     """Which dataset, and where. ``root`` is only a location: keys depend on the contents of files, not on it.
 
     ``sensor``: the sensor whose files are read, in datasets whose scenes have files of several.
+    ``simplify``: most faces of a mesh, None for all.
     """
 
     name: str
@@ -48,13 +49,15 @@ class DatasetConfig:
     models: str = "models"
     targets: str | None = "test_targets_bop19.json"
     sensor: str | None = None
+    simplify: FaceCount | None = None
 
     def open(self) -> Dataset:
         """The dataset, checked. Raises BadInput."""
         root, sensor = Path(self.root).expanduser(), self.sensor
-        return open_dataset(
+        data = open_dataset(
             root, name=self.name, split=self.split, models=self.models, targets=self.targets, sensor=sensor
         )
+        return replace(data, simplify=self.simplify)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,8 @@ class Dataset:
     """A BOP dataset whose targets have images, cameras and models. Pixels and meshes are read on demand.
 
     ``targets`` are sorted by scene, image and object; ``models_info`` is empty without models_info.json. ``warnings``:
-    results of sanity checks when it was opened. Every method raises BadInput for input that cannot be used, in one line
+    results of sanity checks when it was opened. ``simplify``: most faces of a mesh from which templates are rendered,
+    None for all; scores use the mesh as it is. Every method raises BadInput for input that cannot be used, in one line
     with the file, scene, image and field.
     """
 
@@ -74,6 +78,7 @@ class Dataset:
     targets: tuple[Target, ...] = ()
     warnings: tuple[str, ...] = ()
     sensor: str = ""
+    simplify: int | None = None
     _scenes: dict[int, Scene] = field(default_factory=dict, repr=False)
 
     @property
@@ -213,14 +218,23 @@ class Dataset:
         return find_model(self.root / (folder or self.models), obj_id)
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
-        """Mesh, diameter and symmetries, from ``folder`` (None: the dataset's models; "models_eval" for metrics)."""
+        """Mesh, diameter and symmetries, from ``folder`` (None: the dataset's models; "models_eval" for metrics).
+
+        Only the dataset's models are simplified.
+        """
         path = self.model_path(obj_id, folder=folder)
         infos = read_models_info(path.parent / "models_info.json") if folder else self.models_info
-        return read_model(path, obj_id, infos, distances_mm=self._distances_mm(obj_id))
+        simplify = None if folder else self.simplify
+        return read_model(path, obj_id, infos, distances_mm=self._distances_mm(obj_id), simplify=simplify)
+
+    def model_warning(self, obj_id: int, facts: MeshFacts) -> str:
+        """What models_info.json states otherwise than the mesh, "" for nothing."""
+        info = self.models_info.get(obj_id)
+        return "" if info is None else compare_diameters(self.model_path(obj_id), facts, info)
 
     def mesh_digest(self, obj_id: int) -> str:
         """``object_model(obj_id).mesh.digest``, without parsing the mesh where its format allows."""
-        return mesh_digest(self.model_path(obj_id))
+        return prepared_digest(self.model_path(obj_id), simplify=self.simplify)
 
     def _distances_mm(self, obj_id: int) -> list[float]:
         images = {(t.scene_id, t.im_id) for t in self.targets if t.obj_id == obj_id}

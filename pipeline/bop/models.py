@@ -16,8 +16,8 @@ from pipeline.bop.scene import describe_rotation_fault
 from pipeline.errors import BadInput
 from pipeline.functional.rigid import rigid
 from pipeline.io.digests import file_exists
-from pipeline.io.meshes import diameter_mm, read_mesh
-from pipeline.items.objects import Mesh, ObjectModel
+from pipeline.io.meshes import prepare_mesh
+from pipeline.items.objects import MeshFacts, ObjectModel
 
 MAX_SYMMETRY_STEP = 0.01
 """Largest displacement of a vertex between neighbouring discretised symmetries, as a fraction of the diameter (BOP)."""
@@ -32,15 +32,11 @@ A bounding box's diagonal, which some datasets state as diameter, is up to 1.73 
 
 @dataclass(frozen=True, eq=False)
 class ModelInfo:
-    """An entry of models_info.json, mm. ``centre``: centre of the bounding box in the object frame, None if unknown.
-
-    ``is_diagonal``: whether the diameter is the box's diagonal. It is too long then, unless the object is a box.
-    """
+    """An entry of models_info.json, mm. ``centre``: centre of the bounding box in the object frame, None if unknown."""
 
     diameter_mm: float
     symmetries: Float[np.ndarray, "s 4 4"]
     centre: Float[np.ndarray, " 3"] | None
-    is_diagonal: bool = False
 
 
 def read_models_info(path: Path) -> dict[int, ModelInfo]:
@@ -52,30 +48,36 @@ def read_models_info(path: Path) -> dict[int, ModelInfo]:
 
 
 def read_model(
-    path: Path, obj_id: int, infos: dict[int, ModelInfo], *, distances_mm: Sequence[float] = ()
+    path: Path,
+    obj_id: int,
+    infos: dict[int, ModelInfo],
+    *,
+    distances_mm: Sequence[float] = (),
+    simplify: int | None = None,
 ) -> ObjectModel:
-    """The object of a mesh file. ``distances_mm``: its annotated distances to the camera, to detect wrong units.
+    """The object of a mesh file, with at most ``simplify`` faces.
 
+    ``distances_mm``: its annotated distances to the camera, to detect wrong units.
     Raises BadInput for a mesh that models_info.json (if it exists) does not list, and for lengths in different units.
     """
     check_model_files(path, obj_id, infos)
-    mesh = read_mesh(path)
-    measured = diameter_mm(mesh)
+    mesh, facts = prepare_mesh(path, simplify=simplify)
     info = infos.get(obj_id)
-    warning = "" if info is None else _compare_diameters(path, mesh, measured, info)
-    if fault := _describe_unit_fault(measured, distances_mm):
+    if info is not None:
+        compare_diameters(path, facts, info)
+    if fault := _describe_unit_fault(facts.diameter_mm, distances_mm):
         raise BadInput(path, found=fault, needed="mesh and cam_t_m2c both in millimetres")
     if info is None:
-        return ObjectModel(obj_id, mesh, measured)
-    return ObjectModel(obj_id, mesh, info.diameter_mm, info.symmetries, warning)
+        return ObjectModel(obj_id, mesh, facts.diameter_mm, facts=facts)
+    return ObjectModel(obj_id, mesh, info.diameter_mm, info.symmetries, facts)
 
 
-def _compare_diameters(path: Path, mesh: Mesh, measured: float, info: ModelInfo) -> str:
+def compare_diameters(path: Path, facts: MeshFacts, info: ModelInfo) -> str:
     """A warning if models_info.json states another diameter than the mesh has, "" if they agree.
 
     Raises BadInput if the two look like different units of length.
     """
-    stated = info.diameter_mm
+    stated, measured = info.diameter_mm, facts.diameter_mm
     if abs(measured - stated) <= 0.1 * stated:
         return ""
     says = f"a mesh of diameter {measured:.4g}{{}} where models_info.json says {stated:.4g}"
@@ -84,8 +86,8 @@ def _compare_diameters(path: Path, mesh: Mesh, measured: float, info: ModelInfo)
             if factor / tolerance < ratio < factor * tolerance:
                 looks = f" (it looks like {unit})" if of_mesh else f" (models_info.json looks like {unit})"
                 raise BadInput(path, found=says.format(looks), needed="both in millimetres")
-    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    hint = ", the diagonal of its bounding box" if abs(stated - diagonal) < 0.02 * diagonal else ""
+    is_diagonal = abs(stated - facts.diagonal_mm) < 0.02 * facts.diagonal_mm
+    hint = ", the diagonal of its bounding box" if is_diagonal else ""
     return f"{path.name}: found {says.format('')}{hint}; scores use models_info.json, as BOP's do"
 
 
@@ -152,9 +154,8 @@ def _parse_model_info(record: Any, where: str) -> ModelInfo:
         offsets.append(offset)
     arrays = np.reshape(discrete, (-1, 4, 4)), np.reshape(axes, (-1, 3)), np.reshape(offsets, (-1, 3))
     box = _parse_box(record, where)
-    is_diagonal = box is not None and abs(float(diameter) / float(np.linalg.norm(box[3:]) or 1) - 1) < 0.001
     centre = None if box is None else box[:3] + box[3:] / 2
-    return ModelInfo(float(diameter), symmetry_transforms(*arrays), centre, is_diagonal)
+    return ModelInfo(float(diameter), symmetry_transforms(*arrays), centre)
 
 
 def _parse_discrete(value: Any, where: str) -> Float[np.ndarray, "4 4"]:

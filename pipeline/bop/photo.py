@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,10 +17,10 @@ from pipeline.bop.lens import Lens, parse_lens
 from pipeline.bop.scene import Box, check_K, xyxy_from_xywh
 from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import denormalize_camera
-from pipeline.io.meshes import diameter_mm, read_mesh
+from pipeline.io.meshes import prepare_mesh, prepared_digest
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.spec import Positive, PositiveFloat, Spec, digest, spec
+from pipeline.spec import FaceCount, Positive, PositiveFloat, Spec, spec
 
 SCENE_ID, IM_ID = 0, 0
 _MIN_DIAMETER_MM = 2.0
@@ -35,6 +35,7 @@ class PhotoConfig(Spec):
     object's value in a mask that labels several. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres.
     ``distortion``: k1, k2, p1, p2[, k3[, k4, k5, k6]] of OpenCV's model; the photograph, the mask and the box are
     undistorted before anything else.
+    ``simplify``: most faces of a mesh, None for all.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -47,6 +48,7 @@ class PhotoConfig(Spec):
     bbox: tuple[float, ...] | None = None
     scale: PositiveFloat = 1.0
     distortion: tuple[Any, ...] | str | None = None
+    simplify: FaceCount | None = None
     name: str = "photo"
 
     def open(self) -> Photo:
@@ -84,6 +86,7 @@ class PhotoConfig(Spec):
             bbox_xyxy=None if self.bbox is None else xyxy_from_xywh(self.bbox),
             scale=self.scale,
             lens=None if self.distortion is None else parse_lens(self.distortion, K, size_hw),
+            simplify=self.simplify,
         )
 
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -202,20 +205,14 @@ class Photo(Dataset):
         return self.mesh_paths[obj_id - 1]
 
     def mesh_digest(self, obj_id: int) -> str:
-        """Digest of an object's mesh after scaling."""
-        return self._digest_after_scaling(super().mesh_digest(obj_id))
+        """Digest of an object's mesh, scaled and simplified."""
+        return prepared_digest(self.model_path(obj_id), scale=self.scale, simplify=self.simplify)
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
-        """An object with its mesh scaled. Raises BadInput for a mesh too small to be in millimetres."""
+        """An object with its mesh scaled and simplified. Raises BadInput for a mesh too small to be in millimetres."""
         path = self.model_path(obj_id)
-        mesh = read_mesh(path)
-        mesh = replace(mesh, vertices=mesh.vertices * self.scale, digest=self._digest_after_scaling(mesh.digest))
-        diameter = diameter_mm(mesh)
-        if diameter < _MIN_DIAMETER_MM:
-            found = f"a mesh of diameter {diameter:.3g} (it looks like metres)"
+        mesh, facts = prepare_mesh(path, scale=self.scale, simplify=self.simplify)
+        if facts.diameter_mm < _MIN_DIAMETER_MM:
+            found = f"a mesh of diameter {facts.diameter_mm:.3g} (it looks like metres)"
             raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
-        return ObjectModel(obj_id, mesh, diameter)
-
-    def _digest_after_scaling(self, mesh: str) -> str:
-        """Digest of a mesh after scaling, from the digest of its file."""
-        return mesh if self.scale == 1.0 else digest([mesh, self.scale])
+        return ObjectModel(obj_id, mesh, facts.diameter_mm, facts=facts)

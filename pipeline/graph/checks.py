@@ -5,7 +5,7 @@ Warnings are printed when a run starts and recorded in poses.json.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import diagnose_camera
 from pipeline.graph.context import Context, ImageId
 from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
+from pipeline.items.objects import MeshFacts
 from pipeline.items.views import Detection
 from pipeline.method import Stages
 
@@ -23,7 +24,8 @@ MIN_PIXELS = 16  # smaller masks show no shape
 FULL_SHARE = 0.98  # of the image: such a mask is often inverted, or its colours are
 HALF_SHARE = 0.5  # of the image: a mask this large that also touches all four sides is often the background
 MAX_IDS = 10  # of objects in a warning
-NO_COLOURS = "it has no colours, so templates are grey and poses less accurate; use a textured or coloured mesh"
+MANY_FACES = 1_000_000  # a mesh of more gets a warning with what it costs
+SECONDS_PER_MILLION, GB_PER_MILLION = 5.0, 0.5  # of faces, on one core: benchmarks/meshes.py
 OUTSIDE_SHARE = 0.1  # of a box outside the image: often two corners instead of corner, width and height
 
 
@@ -56,14 +58,12 @@ def settings_warnings(stages: Stages) -> list[str]:
     return warnings
 
 
-def detection_warnings(context: Context, detections: Sequence[Detection], *, cached: bool = False) -> list[str]:
-    """Warnings of settings, dataset, models and detector, then one line per suspicious camera, then one per detection.
+def detection_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
+    """Warnings of settings, dataset and detector, then one line per suspicious camera, then one per detection.
 
-    ``cached``: whether all poses are stored. Cameras are checked only without ground truth: annotated poses show that
-    a camera is right.
+    Cameras are checked only without ground truth: annotated poses show that a camera is right.
     """
     warnings = [*settings_warnings(context.stages), *context.dataset.warnings]
-    warnings += _check_models(context, cached=cached)
     warnings += context.stages.detect.warnings(context.dataset, context.targets)
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
         annotated = context.dataset.has_ground_truth(scene_id)
@@ -77,26 +77,26 @@ def detection_warnings(context: Context, detections: Sequence[Detection], *, cac
     return warnings
 
 
-def _check_models(context: Context, *, cached: bool) -> list[str]:
-    """Warnings about meshes. ``cached``: poses need no mesh, so only those with an unlikely diameter are read.
-
-    Without models_info.json nothing is compared, and no mesh is read for it.
-    """
-    infos = context.dataset.models_info
-    asked = [obj_id for obj_id in context.object_ids if obj_id in infos]
-    read = [obj_id for obj_id in asked if not cached or infos[obj_id].is_diagonal]
-    return [warning for obj_id in read if (warning := context.model(obj_id).warning)]
-
-
-def mesh_warnings(context: Context) -> list[str]:
-    """One line per kind of loss: what the objects' mesh files state that is not in the meshes, and missing colours."""
+def mesh_warnings(context: Context, facts_of: Callable[[int], MeshFacts]) -> list[str]:
+    """Diameters that models_info.json states otherwise, then one line per kind of loss or cost and its objects."""
+    warnings: list[str] = []
     objects: dict[str, list[int]] = {}
     for obj_id in context.object_ids:
-        mesh = context.model(obj_id).mesh
-        has_colours = mesh.colours is not None or mesh.texture is not None
-        for warning in (*mesh.warnings, *(() if has_colours else (NO_COLOURS,))):
-            objects.setdefault(warning, []).append(obj_id)
-    return [f"{_describe_objects(obj_ids)}: {warning}" for warning, obj_ids in objects.items()]
+        facts = facts_of(obj_id)
+        if warning := context.dataset.model_warning(obj_id, facts):
+            warnings.append(warning)
+        for text in (*facts.warnings, *_check_size(facts, context.dataset.simplify)):
+            objects.setdefault(text, []).append(obj_id)
+    return warnings + [f"{_describe_objects(obj_ids)}: {text}" for text, obj_ids in objects.items()]
+
+
+def _check_size(facts: MeshFacts, simplify: int | None) -> tuple[str, ...]:
+    """What a mesh of many faces costs, unless the user has decided how many it may have."""
+    if simplify is not None or facts.faces <= MANY_FACES:
+        return ()
+    millions = facts.faces / 1e6
+    cost = f"about {millions * SECONDS_PER_MILLION:.0f} s and {millions * GB_PER_MILLION:.1f} GB to read and prepare it"
+    return (f"it has {millions:.1f} million faces: {cost}; dataset.simplify=200000 renders a smaller one",)
 
 
 def _describe_objects(obj_ids: Sequence[int]) -> str:

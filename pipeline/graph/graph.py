@@ -88,10 +88,12 @@ class Graph:
         return detection_warnings(self.context, self.detect(), cached=True)
 
     def warnings(self) -> list[str]:
-        """Results of sanity checks on detections, cameras and meshes, one line each; cached runs read no mesh."""
-        detections, cached = self.detect(), self.context.store.is_complete(self.poses.run_ref())
-        warnings = detection_warnings(self.context, detections, cached=cached)
-        return warnings if cached else warnings + mesh_warnings(self.context)
+        """Results of sanity checks on dataset, detections, cameras and meshes, one line each."""
+        return detection_warnings(self.context, self.detect()) + self.mesh_warnings()
+
+    def mesh_warnings(self) -> list[str]:
+        """Those on meshes. A mesh is read only if its templates are missing."""
+        return mesh_warnings(self.context, self.templates.mesh_facts)
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
@@ -99,7 +101,7 @@ class Graph:
         self.detect()
         if not self.context.store.is_complete(self.poses.run_ref()):
             for obj_id in self.context.object_ids:
-                self.context.model(obj_id)
+                self.templates.mesh_facts(obj_id)
         self.onboard()
         return self.poses.estimate()
 

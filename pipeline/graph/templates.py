@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, cached_property, lru_cache, partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
 from pipeline.items.features import CropFeatures, FittedArrays, TemplateCells
 from pipeline.items.fit import Fit
+from pipeline.items.objects import MeshFacts
 from pipeline.items.online import TemplateView
 from pipeline.items.views import Crops, Geometry, Templates
 from pipeline.stages.crop import HALF
@@ -87,6 +88,19 @@ class TemplateNodes:
         recipe = {"kind": "templates", "render": self.context.stages.render.recipe()}
         return make_ref("templates", recipe, {"mesh": self.context.mesh_digest(obj_id)})
 
+    @cached_property
+    def mesh_facts(self) -> Callable[[int], MeshFacts]:
+        """What warnings say of an object's mesh: stored with the templates, else found by reading the mesh."""
+        return lru_cache(maxsize=None)(self._mesh_facts)
+
+    def _mesh_facts(self, obj_id: int) -> MeshFacts:
+        ref = self.templates(obj_id)
+        if self.context.store.is_complete(ref):
+            stored = self.context.store.read(ref).document.get("mesh")  # absent in entries of older versions
+            if stored is not None:
+                return MeshFacts(**(stored | {"warnings": tuple(stored["warnings"])}))
+        return self.context.model(obj_id).facts
+
     def crops(self, obj_id: int) -> Ref:
         """Their crops."""
         recipe = {"kind": "template crops", "crop": self.context.stages.crop.recipe()}
@@ -120,8 +134,9 @@ class TemplateNodes:
             "depth_mm": Layout((height, width), "float32", compress=True),
             "T_cam_obj": Layout((4, 4), "float64"),
         }
+        document = {"K": K.tolist(), "mesh": asdict(self.context.model(obj_id).facts)}
         self.context.fill(
-            "templates", f"render object {obj_id}", {ref: layout}, count, VIEWS_PER_BATCH, compute, {"K": K.tolist()},
+            "templates", f"render object {obj_id}", {ref: layout}, count, VIEWS_PER_BATCH, compute, document,
             timing=timing_key("templates", self.context.stages),
         )  # fmt: skip
         return count

@@ -31,11 +31,24 @@ class ObjectModel:
     """An object whose pose can be estimated.
 
     ``symmetries``: rigid transforms T_obj_obj (s 4 4, mm), the identity first, continuous symmetries discretised.
-    ``warning``: what is implausible about its files, "" for nothing.
     """
 
     obj_id: int
     mesh: Mesh
     diameter_mm: float
     symmetries: Float[np.ndarray, "s 4 4"] = field(default_factory=lambda: np.eye(4)[None])
-    warning: str = ""
+    facts: MeshFacts = field(default_factory=lambda: MeshFacts(0.0, 0.0, 0))
+
+
+@dataclass(frozen=True)
+class MeshFacts:
+    """What warnings say of a mesh. Stored with its templates, so that a run that reads no mesh says the same.
+
+    ``diameter_mm``: measured; ``diagonal_mm``: of its bounding box; ``faces``: that are rendered. ``warnings``: what
+    its file states that is not in the mesh, missing colours, and what was simplified.
+    """
+
+    diameter_mm: float
+    diagonal_mm: float
+    faces: int
+    warnings: tuple[str, ...] = ()

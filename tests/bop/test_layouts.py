@@ -69,7 +69,7 @@ def test_models_in_other_formats_are_read(root: Path, suffix: str):
         trimesh.creation.box(extents=2 * np.array(half)).export(root / "models" / f"obj_{obj_id:06d}{suffix}")
     model = open_tiny(root).object_model(2)
     assert model.diameter_mm == pytest.approx(2 * np.linalg.norm(HALF_MM[2]))
-    assert model.warning == ""
+    assert open_tiny(root).model_warning(2, model.facts) == ""
 
 
 def name_after_sensors(root: Path, sensors: list[str], *, modality: str = "rgb") -> Path:
@@ -206,9 +206,10 @@ def test_diameters_in_other_units_are_refused(root: Path, factor: float, of_mesh
 def test_other_diameters_are_a_warning_and_kept(root: Path, factor: float):
     stated = 2 * float(np.linalg.norm(HALF_MM[1])) * factor
     edit_json(root / "models" / "models_info.json", lambda i: i["1"].update(diameter=stated))
-    model = open_tiny(root).object_model(1)
+    dataset = open_tiny(root)
+    model = dataset.object_model(1)
     assert model.diameter_mm == stated
-    assert f"models_info.json says {stated:.4g}" in model.warning
+    assert f"models_info.json says {stated:.4g}" in dataset.model_warning(1, model.facts)
 
 
 @pytest.mark.parametrize("extents", [(60, 60, 60), (100, 100, 40), (200, 150, 150)])
@@ -220,7 +221,8 @@ def test_diagonal_of_the_bounding_box_as_diameter_is_recognised(root: Path, exte
     octahedron.export(root / "models" / "obj_000001.ply")
     diagonal = float(np.linalg.norm(extents))
     edit_json(root / "models" / "models_info.json", lambda i: i["1"].update(diameter=diagonal))
-    assert "diagonal of its bounding box" in open_tiny(root).object_model(1).warning
+    dataset = open_tiny(root)
+    assert "diagonal of its bounding box" in dataset.model_warning(1, dataset.object_model(1).facts)
 
 
 @pytest.mark.parametrize("obj_id", [1000008, 999999, 12345678])

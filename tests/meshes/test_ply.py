@@ -6,7 +6,7 @@ from mesh_files import BLUE, CORNER_COLOURS, RED, SQUARE, UV, area, assert_corne
 from PIL import Image
 
 from pipeline.errors import BadInput
-from pipeline.io.meshes import mesh_digest, read_mesh
+from pipeline.io.meshes import identify_mesh, read_mesh
 
 TRIANGLES = [[0, 1, 2], [0, 2, 3]]
 NUMPY = {"uchar": "u1", "ushort": "u2", "int": "i4", "float": "f4", "double": "f8", "char": "i1"}
@@ -55,7 +55,7 @@ def test_vertex_colours_of_every_type_scale_and_name_arrive(form, names, kind, t
     mesh = read_mesh(path)
     np.testing.assert_array_equal(mesh.vertices, SQUARE)
     assert_corner_colours(mesh, CORNER_COLOURS)
-    assert mesh.digest == mesh_digest(path)
+    assert mesh.digest == identify_mesh(path).digest
 
 
 def test_surface_colour_is_preferred_to_that_of_reflections(tmp_path):
@@ -130,10 +130,10 @@ def test_several_textures_arrive_by_their_numbers(tmp_path):
     assert_corner_colours(mesh, CORNER_COLOURS)
     assert_corner_colours(mesh, np.tile([1, 2, 3], (4, 1)), SQUARE + np.array([0, 0, 5]))
     assert area(mesh) == pytest.approx(300)
-    assert mesh.digest == mesh_digest(path)
+    assert mesh.digest == identify_mesh(path).digest
     (tmp_path / "t1.png").unlink()
     with pytest.raises(BadInput, match=r"t1\.png: found no such file"):
-        mesh_digest(path)
+        identify_mesh(path)
 
 
 def test_several_textures_without_numbers_are_refused(tmp_path):

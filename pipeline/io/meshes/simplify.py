@@ -1,0 +1,68 @@
+"""Mesh -> a mesh of fewer faces (Garland and Heckbert, SIGGRAPH 1997), with its colours in a new texture."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.functional.arrays import rank_rows
+from pipeline.functional.surface import spread_points, surface_distance
+from pipeline.io.meshes.bake import bake_texture
+from pipeline.items.objects import Mesh
+
+SIMPLIFY_VERSION = f"1, fast-simplification {version('fast-simplification')}"
+_MEASURED = 100_000  # points of each surface at which the distance to the other one is measured
+_WELD = 1e-7  # of the mesh's largest side: vertices this close are one, or seams would tear open
+
+
+def simplify_mesh(mesh: Mesh, faces: int, diameter_mm: float) -> tuple[Mesh, str]:
+    """A mesh of about ``faces`` faces at most, and what it lost, in one line.
+
+    Edges are collapsed without regard to colours: what the surface shows, be it a texture or colours of vertices, is
+    baked into a new texture.
+    """
+    vertices, few = _collapse(mesh, faces)
+    result = Mesh(vertices, few, digest=mesh.digest, warnings=mesh.warnings)
+    distance = _measure_distance(mesh, result)
+    note = f"simplified from {len(mesh.faces)} to {len(few)} faces (dataset.simplify={faces}), which moves its surface"
+    note += f" by up to {distance:.2g} mm, {distance / diameter_mm:.2%} of the diameter"
+    if mesh.texture is None and mesh.colours is None:
+        return result, note
+    result = bake_texture(mesh, result)
+    assert result.texture is not None
+    height, width = result.texture.shape[:2]
+    what = "texture" if mesh.texture is not None else "colours"
+    return result, f"{note}; its {what} became a texture of {width} x {height}"
+
+
+def _collapse(mesh: Mesh, faces: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices and faces after collapsing edges, until there are no more than ``faces`` or no edge can go."""
+    import fast_simplification
+
+    grid = np.rint(mesh.vertices / (_WELD * np.ptp(mesh.vertices, axis=0).max()))
+    _, first, index = np.unique(rank_rows(list(grid.T)), return_index=True, return_inverse=True)
+    welded = index.reshape(-1)[mesh.faces]
+    degenerate = (welded == np.roll(welded, 1, axis=1)).any(axis=1)
+    welded = np.ascontiguousarray(welded[~degenerate], dtype=np.int32)
+    if len(welded) <= faces:
+        return mesh.vertices[first], welded.astype(np.int64)
+    for keep_border in (True, False):  # without it, corners of open sheets wear off
+        vertices, few = fast_simplification.simplify(
+            mesh.vertices[first], welded, target_count=faces, preserve_border=keep_border
+        )
+        if len(few) <= faces:
+            break
+    return vertices, few.astype(np.int64)
+
+
+def _measure_distance(first: Mesh, second: Mesh) -> float:
+    """Largest distance between two surfaces, in both directions, as Metro samples it (Cignoni et al., CGF 1998)."""
+    on_first, on_second = (spread_points(m.vertices, m.faces, _MEASURED) for m in (first, second))
+    used = np.unique(first.faces)
+    corners = first.vertices[used[:: max(1, len(used) // _MEASURED)]]
+    points = np.concatenate([on_first.interpolate(first.vertices, first.faces), corners])
+    there = surface_distance(points, second.vertices, second.faces, on_second)
+    points = np.concatenate([on_second.interpolate(second.vertices, second.faces), second.vertices[:_MEASURED]])
+    return max(there, surface_distance(points, first.vertices, first.faces, on_first))
