@@ -20,7 +20,7 @@ from pipeline.functional.camera_diagnosis import denormalize_camera
 from pipeline.io.meshes import prepare_mesh, prepared_digest
 from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.spec import FaceCount, Positive, PositiveFloat, Spec, spec
+from pipeline.spec import FaceCount, Positive, PositiveFloat, Spec, digest, spec
 
 SCENE_ID, IM_ID = 0, 0
 _MIN_DIAMETER_MM = 2.0

@@ -85,11 +85,11 @@ class Graph:
 
     def detection_warnings(self) -> list[str]:
         """Results of sanity checks on detections and cameras, one line each; no mesh is read for them."""
-        return detection_warnings(self.context, self.detect(), cached=True)
+        return detection_warnings(self.context, self.detect())
 
     def warnings(self) -> list[str]:
         """Results of sanity checks on dataset, detections, cameras and meshes, one line each."""
-        return detection_warnings(self.context, self.detect()) + self.mesh_warnings()
+        return self.detection_warnings() + self.mesh_warnings()
 
     def mesh_warnings(self) -> list[str]:
         """Those on meshes. A mesh is read only if its templates are missing."""
