@@ -10,12 +10,15 @@ from command import run_dzop
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from pipeline.configuration import build_stages
 from pipeline.fetch import DATASETS
+from pipeline.io.checkpoints import offline
 from pipeline.report import published
 from pipeline.report.reproduction import INSTANCES
 from pipeline.reproduction import Request, job_cost, list_jobs
 from pipeline.reproduction.jobs import SWEEPS
 
+VARIATIONS = ("no_coprojection", "no_clusters", "no_subpixel", "none")
 CONF = Path(__file__).parents[1] / "conf"
 
 
@@ -36,8 +39,12 @@ def started(monkeypatch) -> list[list[str]]:
 def test_every_job_composes_and_its_sweep_has_the_jobs_that_the_plan_counts():
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for job in list_jobs(Request(images=3, baselines=("zs6d",))):
-            config = compose("config", overrides=list(job.arguments))
-            assert OmegaConf.select(config, "select.sample") == 3
+            for variation in VARIATIONS if "sweep=correspondence" in job.arguments else ["none"]:
+                config = compose("config", overrides=[*job.arguments, f"variation={variation}"])
+                values = OmegaConf.to_container(config, resolve=True)
+                assert (values["select"]["sample"], values["variation"]) == (3, variation)
+                with offline():
+                    build_stages(values)
     for name, (count, _) in SWEEPS.items():
         swept = OmegaConf.load(CONF / "sweep" / f"{name}.yaml").hydra.sweeper.params
         assert [len(str(values).split(",")) for values in swept.values()] == [count]

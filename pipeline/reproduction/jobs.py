@@ -9,6 +9,8 @@ from pipeline.fetch.dataset import DETECTIONS
 
 METHOD = "dzop_paper"
 EXTRACT = "stable_diffusion"
+VARIED, VARIED_METHOD = "correspondence", "dzop"
+"""The sweep that replaces stages whose fields dzop_paper sets, and the method with the same stages that it takes."""
 ABLATED = "lmo"  # the dataset of the paper's ablations, which use its ground-truth boxes
 TIMESTEPS = 10  # of the sweep of that name; 50, one of them, is the default
 # sweep -> (jobs, of which extract features of their own)
@@ -81,27 +83,22 @@ def _comparison(request: Request, dataset: str, method: str) -> Job:
 def _ablations(request: Request) -> list[Job]:
     """The table of correspondence estimation and the curves, on ground-truth boxes as in the paper."""
     arguments = (*_common(request, ABLATED, request.method), "detect=gt_bbox")
-    base = Job(f"{ABLATED}: {request.method} on ground-truth boxes", ABLATED, request.method, arguments, 1, 0, 1)
-    sweeps = [
-        Job(
-            f"{ABLATED}: ablation {name}",
-            ABLATED,
-            request.method,
-            (f"sweep={name}", *arguments),
-            count - 1,  # one of them is the base run
-            extractions,
-            extractions,
-        )
-        for name, (count, extractions) in SWEEPS.items()
-    ]
-    return [base, *sweeps]
+    jobs = [Job(f"{ABLATED}: {request.method} on ground-truth boxes", ABLATED, request.method, arguments, 1, 0, 1)]
+    for name, (count, extractions) in SWEEPS.items():
+        title, costs = f"{ABLATED}: ablation {name}", (count - 1, extractions, extractions)  # one is the base run
+        words = arguments
+        if name == VARIED and request.method == METHOD:
+            words = (*_common(request, ABLATED, VARIED_METHOD, extract=EXTRACT), "detect=gt_bbox")
+            title, costs = f"{title}, of {VARIED_METHOD}", (count, 1, 1)  # its crops are others
+        jobs.append(Job(title, ABLATED, request.method, (f"sweep={name}", *words), *costs))
+    return jobs
 
 
-def _common(request: Request, dataset: str, method: str) -> tuple[str, ...]:
+def _common(request: Request, dataset: str, method: str, extract: str = "") -> tuple[str, ...]:
     """Options of every job of a dataset and a method."""
     arguments = [f"method={method}", f"dataset={dataset}", f"dataset.root={request.root(dataset)}"]
-    if method == request.method:
-        arguments.append(f"extract={EXTRACT}")
+    if extract or method == request.method:
+        arguments.append(f"extract={extract or EXTRACT}")
     if request.images is not None:
         arguments.append(f"select.sample={request.images}")
     return (*arguments, f"out={request.out}", *request.overrides)
