@@ -131,12 +131,28 @@ def test_the_same_points_give_the_references_pose(stages, reading):
     np.testing.assert_allclose(ours, reference.solve(points, px, K, reading=reading), atol=1e-6)
 
 
-def test_the_preset_is_the_yaml():
+def composed(*overrides: str) -> dict:
     with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
-        config = compose("config", overrides=["method=dzop_paper", "extract=hog"])
-    stages = build_stages(OmegaConf.to_container(config, resolve=True))
+        return OmegaConf.to_container(compose("config", overrides=list(overrides)), resolve=True)
+
+
+def test_the_preset_is_the_yaml():
+    stages = build_stages(composed("method=dzop_paper", "extract=hog"))
     for name in ("crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine"):
         assert getattr(stages, name) == getattr(LETTER, name), name
+
+
+@pytest.mark.parametrize(
+    ("overrides", "noise"),
+    [
+        (("method=dzop_paper", "extract=stable_diffusion"), "shared"),
+        (("method=dzop_sd",), "none"),
+        (("method=dzop_sd", "extract.noise=independent"), "independent"),
+    ],
+)
+def test_the_letter_keeps_the_shared_noise_and_dzop_sd_adds_none(overrides, noise):
+    extract = composed(*overrides)["extract"]
+    assert (extract["_target_"].rsplit(".", 1)[1], extract["noise"]) == ("StableDiffusion", noise)
 
 
 @pytest.mark.parametrize(("stages", "reading"), READINGS)
