@@ -66,6 +66,7 @@ NEEDED = {
     "dataset.image": "the photograph's file",
     "dataset.root": "the dataset's folder",
     "detect.path": "a detector's json file",
+    "store.url": "s3://bucket/prefix",
 }
 """What required fields take, by name."""
 QUOTING_EXAMPLE = """'dataset.image="my shot.png"'"""
@@ -132,8 +133,7 @@ def _format_error(error: BaseException) -> str:
     text = str(error).split("\nConfig search path")[0]
     if text.startswith("Could not override"):
         name = text.split("'")[1]
-        needed = f"needs one that the yamls in conf/ have{suggest_field(name)}"
-        text = f"Could not override '{name}': found no such field, {needed}"
+        text = f"Could not override '{name}': found no such field, needs one that --help lists{suggest_field(name)}"
     if "Could not find '" in text:
         name, _, listed = text.partition("Could not find '")[2].partition("'")
         group, _, variant = name.rpartition("/")
@@ -141,6 +141,8 @@ def _format_error(error: BaseException) -> str:
         text = f"Could not find '{name}'{note} {listed}"
     if "hydra.cc" in text:  # a value that Hydra's grammar cannot parse
         text = text.split("See https")[0].strip()
+        if "missing EQUAL" in text:
+            return f"error: found {text.split()[3]}, needs NAME=VALUE, such as step=report; dzop --help lists all names"
         text = f"{text}: a value with special characters needs both kinds of quotes, as {QUOTING_EXAMPLE}"
     return "error: " + " ".join(text.split())
 
@@ -172,7 +174,7 @@ def _hydra_main(config: DictConfig) -> None:
             job = HydraConfig.get()
             record_finished_job(int(job.job.num), list(job.overrides.task), answers)
     except MissingMandatoryValue as error:
-        needed = NEEDED.get(str(error.full_key), "a value: the yaml in conf/ says which")
+        needed = NEEDED.get(str(error.full_key), "a value; the yaml in conf/ explains it")
         _fail_job(config, BadInput(error.full_key, found="nothing", needed=needed))
     except OmegaConfBaseException as error:
         _fail_job(config, DzopError(_format_error(error).removeprefix("error: ")))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin, get_type_hints
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
@@ -73,6 +73,7 @@ def build_variant(values: Mapping[str, Any], where: str) -> Any:
     fields = {name: _build_field(value, f"{where}.{name}") for name, value in values.items()}
     cls = _find_class(fields.pop("_target_", None), f"{where}._target_")
     if where.split(".")[0] in STAGES and cls.__module__.split(".")[0] != "pipeline":
+        _check_contract(cls, where)
         _check_kind(cls, where)
         print(f"warning: {where}: {OWN_CLASS_WARNING}", file=sys.stderr)
     variant: Any = build(cls, fields, where=where)
@@ -99,8 +100,18 @@ def _find_class(target: object, where: str) -> type:
     return cls
 
 
+def _check_contract(cls: type, where: str) -> None:
+    """Raise BadInput for an own variant of a stage that does not derive from the stage's base class."""
+    hint = get_type_hints(Stages).get(where)
+    base = get_origin(hint) or hint
+    if base is not None and not issubclass(cls, base):
+        place = f"{cls.__module__}.{cls.__qualname__}"
+        needed = f"a subclass of {base.__name__} ({base.__module__})"
+        raise BadInput(place, found="a class without the contract of its stage", needed=needed)
+
+
 def _check_kind(cls: type, where: str) -> None:
-    """Raise BadInput unless an own variant's kind, which its cached results are found by, belongs to it alone."""
+    """Raise BadInput unless an own variant's kind follows the rule and is not that of a variant of the package."""
     module, kind = cls.__module__.split(".")[-1], getattr(cls, "kind", None)
     stage = where if where in STAGES else str(kind).split(".")[0]  # a nested field may hold a variant of another stage
     place = f"{cls.__module__}.{cls.__qualname__}.kind"
@@ -125,11 +136,13 @@ def _may_import_others() -> bool:
 
 
 def suggest_field(name: str) -> str:
-    """What a field that a command line sets in vain may mean: that of another variant, or one with a similar name."""
+    """Hint for an unknown field: variants that have it, a parent that is a value, or a field with a similar name."""
     known = _list_fields()
     if choices := known.get(name):
         return f"; {', '.join(choices)} {'has' if len(choices) == 1 else 'have'} it"
     group, dot, field = name.rpartition(".")
+    if "." in group and group in known:
+        return f"; {group} is a value and has no fields"
     return did_you_mean(field, [k.removeprefix(group + dot) for k in known if k.rpartition(".")[0] == group])
 
 

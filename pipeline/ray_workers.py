@@ -1,4 +1,4 @@
-"""Run tasks on a Ray cluster. Only this module imports Ray (``pip install 'dzop[ray]'``).
+"""Run tasks on a Ray cluster. Only this module imports Ray (``pip install --editable '.[ray]'``).
 
 Each worker is an actor that builds the run's graph once, backbone included, and computes one item after another.
 Results go through the store; only counts come back. A worker that dies is replaced, and its item is computed again by
@@ -64,7 +64,7 @@ class RayRuntime(Runtime):
         Raises BadInput without Ray or with a store that workers cannot share, DzopError when the cluster fails.
         """
         if ray is None:
-            raise BadInput("runtime", found="ray, which is not installed", needed="pip install 'dzop[ray]'")
+            raise BadInput("runtime", found="ray, which is not installed", needed="pip install --editable '.[ray]'")
         if isinstance(run.store.config, MemoryStoreConfig):
             raise BadInput("store", found="memory with runtime=ray", needed="a store that workers share: local or s3")
         workers = RayWorkers(self, run, threads)

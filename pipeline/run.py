@@ -222,7 +222,7 @@ def _print_results(
     if failures:
         print("\n" + failures_table(failures))
     reasons = " (each with its reason)" if failures else ""
-    print(f"\n{len(answers) - len(failures)} poses, {len(failures)} without{reasons}")
+    print(f"\nposes found: {len(answers) - len(failures)}, failed: {len(failures)}{reasons}")
     if evaluation is None:
         return
     print(f"\nscores on {detections}")

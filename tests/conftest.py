@@ -75,7 +75,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def s3_server():
     """An S3 server on this machine, with credentials in the environment as users have them."""
-    pytest.importorskip("s3fs", reason="needs s3fs: pip install 'dzop[s3]'")
+    pytest.importorskip("s3fs", reason="needs s3fs: pip install --editable '.[s3]'")
     pytest.importorskip("moto.server", reason="needs moto's server: pip install 'moto[server]'")
     from tests.s3_server import S3Server  # imports pipeline, which must come after the hook above
 

@@ -236,7 +236,7 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
     )  # fmt: skip
     mask = run_dzop(capsys, monkeypatch, *given, f"dataset.mask={frame}/mask_visib/000000_000000.png")
     assert mask.status == 0, mask.err
-    assert "1 poses, 0 without" in mask.out or "0 poses, 1 without" in mask.out
+    assert "poses found: 1, failed: 0" in mask.out or "poses found: 0, failed: 1" in mask.out
     assert len(list(tmp_path.glob("results/dzop-hog-photo_photo-test/*/overlays/*.jpg"))) == 1
     box = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,60]")
     other = run_dzop(capsys, monkeypatch, *given, "dataset.bbox=[100,80,60,70]")
@@ -254,10 +254,16 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
             "Could not find 'match/nearest' (own variants need --config-dir) Available options in 'match'",
         ),
         (("match=cosin",), "; did you mean cosine? Available options in 'match': cosine masked_cosine"),
-        (("cluster.cuont=3",), "needs one that the yamls in conf/ have; did you mean count?"),
+        (("report",), "found 'report', needs NAME=VALUE, such as step=report"),
+        (
+            ("render.count.views=3",),
+            "found no such field, needs one that --help lists; render.count is a value and has no",
+        ),
+        (("store=s3",), "store.url: found nothing, needs s3://bucket/prefix"),
+        (("cluster.cuont=3",), "needs one that --help lists; did you mean count?"),
         (
             ("dataset.mask=a.png",),
-            "found no such field, needs one that the yamls in conf/ have; dataset=photo has it",
+            "found no such field, needs one that --help lists; dataset=photo has it",
         ),
         (
             ("+match.topk=3",),
@@ -370,6 +376,22 @@ def test_a_kind_names_stage_and_file_so_that_no_two_variants_share_results(dzop,
     monkeypatch.syspath_prepend(tmp_path)
     ran = dzop("--config-dir", str(tmp_path / "conf"), "match=first", "plan=true")
     assert f"error: {name}.first.First.kind: {needed}" in ran.err
+
+
+@pytest.mark.parametrize(
+    "other", ["pipeline.spec.Spec", "pipeline.stages.cluster.Clusterer", "pipeline.stages.fuse.Fuser"]
+)
+def test_an_own_variant_derives_from_the_base_class_of_its_stage(dzop, tmp_path, monkeypatch, other):
+    module, _, base = other.rpartition(".")
+    name = f"of_{base.lower()}"
+    (tmp_path / name).mkdir()
+    text = MATCHER.replace("from pipeline.stages.match import Matcher", f"from {module} import {base} as Matcher")
+    (tmp_path / name / "first.py").write_text(text)
+    (tmp_path / "conf" / "match").mkdir(parents=True)
+    (tmp_path / "conf" / "match" / "first.yaml").write_text(f"_target_: {name}.first.First\nlayer: 2\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ran = dzop("--config-dir", str(tmp_path / "conf"), "match=first", "plan=true")
+    assert "needs a subclass of Matcher (pipeline.stages.match)" in ran.err
 
 
 def test_an_own_variant_may_not_have_a_kind_of_the_package(dzop, tmp_path, monkeypatch):

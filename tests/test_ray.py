@@ -67,7 +67,7 @@ class TwoNodes:
 
 @pytest.fixture(scope="module")
 def started() -> Iterator[TwoNodes]:
-    utils = pytest.importorskip("ray.cluster_utils", reason="needs Ray: pip install 'dzop[ray]'")
+    utils = pytest.importorskip("ray.cluster_utils", reason="needs Ray: pip install --editable '.[ray]'")
     nodes = _start(utils.Cluster)
     yield nodes
     nodes.cluster.shutdown()
@@ -121,7 +121,7 @@ def test_without_ray_the_message_says_how_to_install_it(scene, tmp_path, capsys,
     ran = run_dzop(capsys, monkeypatch, *arguments(scene, tmp_path, "runtime=ray"))
     assert (ran.status, ran.err) == (
         1,
-        "error: runtime: found ray, which is not installed, needs pip install 'dzop[ray]'",
+        "error: runtime: found ray, which is not installed, needs pip install --editable '.[ray]'",
     )
 
 
@@ -138,7 +138,7 @@ def test_without_ray_the_message_says_how_to_install_it(scene, tmp_path, capsys,
 def test_impossible_settings_are_reported_before_a_cluster_is_started(
     scene, tmp_path, capsys, monkeypatch, overrides, message
 ):
-    pytest.importorskip("ray", reason="needs Ray: pip install 'dzop[ray]'")
+    pytest.importorskip("ray", reason="needs Ray: pip install --editable '.[ray]'")
     unwanted = "store.root" if "store=memory" in overrides else "nothing"
     given = [word for word in arguments(scene, tmp_path, "runtime=ray") if unwanted not in word]
     ran = run_dzop(capsys, monkeypatch, *given, *overrides)
@@ -149,7 +149,7 @@ def test_impossible_settings_are_reported_before_a_cluster_is_started(
 
 @pytest.mark.parametrize("mode", [0o644, 0o640, 0o666])
 def test_rays_token_is_made_private(tmp_path, monkeypatch, mode):
-    ray_workers = pytest.importorskip("pipeline.ray_workers", reason="needs Ray: pip install 'dzop[ray]'")
+    ray_workers = pytest.importorskip("pipeline.ray_workers", reason="needs Ray: pip install --editable '.[ray]'")
     token = tmp_path / "auth_token"
     token.write_text("secret")
     token.chmod(mode)

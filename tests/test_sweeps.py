@@ -89,7 +89,7 @@ def test_a_failed_job_of_another_launcher_stops_no_other_and_is_recorded(
     command, dzop, start, tmp_path, cache, launcher
 ):
     if launcher == SUBMITIT:
-        pytest.importorskip("submitit", reason="needs submitit: pip install 'dzop[submitit]'")
+        pytest.importorskip("submitit", reason="needs submitit: pip install --editable '.[submitit]'")
     done = start(command("-m", "cluster.count=-1,6", "solve.min_inliers=4", *launcher))
     _, err = done.communicate(timeout=300)
     check_failed_job(done.returncode, err, tmp_path / "results", dzop("step=report"))

@@ -169,7 +169,10 @@ def _unique_names(names: Iterable[str]) -> list[str]:
 
 
 def _summary(sections: Sequence[Section], failed: Sequence[RunRecord], folder: Path) -> str:
-    lines = [f"{section.title}: {len(section.jobs)} runs; {section.headline()}" for section in sections]
+    lines = [
+        f"{section.title}: {len(section.jobs)} run{'s' * (len(section.jobs) != 1)}; {section.headline()}"
+        for section in sections
+    ]
     lines += [f"failed: {' '.join(run.overrides)} ({run.error})" for run in failed]
     lines.append(f"page      {folder / 'index.html'}\nfigures   {folder / 'figures'}\ntables    {folder / 'tables'}")
     return "\n".join(lines)

@@ -166,7 +166,7 @@ class MemoryStoreConfig(Spec):
 
 @spec
 class S3StoreConfig(Spec):
-    """An S3-compatible bucket (``pip install dzop[s3]``), so that several machines share one cache.
+    """An S3-compatible bucket (``pip install --editable '.[s3]'``), so that several machines share one cache.
 
     There are no locks: two workers that need the same entry both compute it, each into a folder of its own, and the
     completion record names the folder that counts. ``timeout_s``: how long one request may take; it is sent up to six
@@ -187,7 +187,9 @@ class S3StoreConfig(Spec):
         try:
             store = BucketStore.open_url(self.url.rstrip("/"), self._options())
         except ImportError:
-            raise BadInput("store", found="s3 without s3fs", needed="pip install 'dzop[s3]'") from None
+            raise BadInput(
+                "store", found="s3fs, which is not installed", needed="pip install --editable '.[s3]'"
+            ) from None
         store.fs.retries = 2  # by s3fs, on top of the three attempts by botocore: six requests
         sync(_check_bucket(store, self.url))
         return Backend(RemoteStore(store, self.url), self.url, None, lambda key, announce: nullcontext())

@@ -175,7 +175,7 @@ def test_a_page_is_made_from_records_on_disk(runs, tmp_path):
     for row in (runs[0], runs[-1]):
         write_run_record(tmp_path, row)
     report = write_report(read_run_records(tmp_path), tmp_path)
-    assert "1 runs; AR" in report.summary
+    assert "1 run; AR" in report.summary
     assert "failed: cluster.count=-1" in report.summary
     with pytest.raises(BadInput, match="needs finished runs"):
         read_run_records(tmp_path / "empty")

@@ -146,7 +146,9 @@ def test_no_pose_puts_points_behind_the_camera(solve):
 
 def test_missing_poselib_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "poselib", None)
-    with pytest.raises(BadInput, match=r"solve=poselib: found no package poselib, needs pip install 'dzop\[poselib\]'"):
+    with pytest.raises(
+        BadInput, match=r"found poselib, which is not installed, needs pip install --editable '\.\[poselib\]'"
+    ):
         Poselib()
 
 

@@ -63,7 +63,7 @@ def test_missing_credentials_are_reported_in_one_line(s3, monkeypatch):
 
 
 def test_a_refused_connection_is_reported_in_one_line():
-    pytest.importorskip("s3fs", reason="needs s3fs: pip install 'dzop[s3]'")
+    pytest.importorskip("s3fs", reason="needs s3fs: pip install --editable '.[s3]'")
     with pytest.raises(StoreUnreachable, match="run again when it answers: completed entries are kept"):
         Store(S3StoreConfig(url="s3://bucket/cache", endpoint_url="http://127.0.0.1:1", anonymous=True))
 

@@ -206,7 +206,9 @@ def _decode_draco(path: Path, data: bytes, names: dict[str, int]) -> dict[str, n
         import DracoPy
     except ImportError:
         found = f"a mesh compressed by Draco ({_DRACO})"
-        raise BadInput(path, found=found, needed="pip install 'dzop[draco]', or a file without compression") from None
+        raise BadInput(
+            path, found=found, needed="pip install --editable '.[draco]', or a file without compression"
+        ) from None
     try:
         decoded = DracoPy.decode(data)
     except Exception as error:  # DracoPy raises its own types, and ValueError

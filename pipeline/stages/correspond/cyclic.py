@@ -1,4 +1,4 @@
-"""fused pair, clusters -> corresponding points, in crop pixels: cells whose match leads back near the start."""
+"""fused pair, clusters -> corresponding points, in crop pixels: matches whose cycle ends near its start."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from pipeline.stages.correspond import Corresponder, cell_px, cells_in_pairs
 class Cyclic(Corresponder):
     """Cyclic buddies (Goodwin et al., "Zero-Shot Category-Level Object Pose Estimation", ECCV 2022, section 3.2).
 
-    From each query cell to its nearest template cell, and from there to the nearest query cell: the ``count`` query
-    cells with the smallest distance to the end of this cycle are kept (0 for mutual nearest neighbours), ties by
-    similarity. Search stays inside the paired cluster; FoundPose uses cluster=one (Örnek et al., ECCV 2024, section
+    A cycle goes from a query cell to its nearest template cell, and from there to the nearest query cell. Its cyclic
+    distance is that between the first and the last cell: 0 for mutual nearest neighbours. The ``count`` query cells of
+    smallest cyclic distance are kept, ties by similarity. Neighbours are searched in the paired cluster only; FoundPose
+    uses cluster=one (Örnek et al., ECCV 2024, section
     3.4). ``metric``: Euclidean distance of features (FoundPose's code) or cosine. Points are the cells' centres.
     """
 

@@ -15,7 +15,7 @@ from pipeline.stages.correspond import Corresponder
 
 @spec
 class Oracle(Corresponder):
-    """Where the template's cells truly lie in the query, inside its mask; occluded points are not excluded."""
+    """True positions of the template's cells in the query, inside its mask; occluded points are not excluded."""
 
     kind: ClassVar[str] = "correspond.oracle"
     version: ClassVar[int] = 1

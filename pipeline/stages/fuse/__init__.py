@@ -44,16 +44,16 @@ class Fuser(Spec, ABC, Generic[Encoded]):
 
     @property
     def fit(self) -> Fit | None:
-        """What is fitted to the object's templates offline."""
+        """A model fitted to the object's templates offline; None for none."""
         return None
 
     def check(self, extract: Extractor) -> None:
-        """Raise BadInput where the variant was trained on features made otherwise than by this extractor."""
+        """Raise BadInput if the variant was trained on features that this extractor does not give."""
         return
 
     @abstractmethod
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> Encoded:
-        """What ``pair`` needs of one image. ``fitted``: arrays of ``fit``, empty without one. Raises NoPose."""
+        """One image's input to ``pair``. ``fitted``: arrays of ``fit``, empty without one. Raises NoPose."""
 
     @abstractmethod
     def pair(self, query: Encoded, template: Encoded) -> FusedPair:
@@ -87,7 +87,7 @@ def sample_cells(
         pairs = zip((query, template), inside, strict=True)
         cells = [features.flatten(1).index_select(1, foreground(mask)) for features, mask in pairs]
     both = torch.cat(cells, dim=1).T
-    if not bool(torch.isfinite(both.sum(0)).all()):  # one value that is not finite makes its sum so
+    if not bool(torch.isfinite(both.sum(0)).all()):  # the sum is finite only if every value is
         raise NoPose("fuse", f"features of layer {layer} are not finite")
     return both
 

@@ -12,7 +12,7 @@ from pipeline.stages.fuse.pca import Pca
 
 @spec
 class Auto(Spec):
-    """``Learned`` with edges for the features its head was trained on, ``Pca`` for all others.
+    """``Learned`` with gradient histograms for the features its head was trained on, ``Pca`` for all others.
 
     Keys are those of the chosen variant.
     """

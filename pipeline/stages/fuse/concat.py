@@ -28,7 +28,7 @@ class Concat(Fuser[CropFeatures]):
     normalise: bool = True
 
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> CropFeatures:
-        """The crop's features as they are: the scale of a layer depends on both images."""
+        """The crop's features, unchanged: the scale of a layer depends on both images."""
         return crop
 
     def pair(self, query: CropFeatures, template: CropFeatures) -> FusedPair:

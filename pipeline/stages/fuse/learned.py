@@ -1,4 +1,4 @@
-"""query and template features -> one map each, by the head trained with the embedded model, and the crops' edges."""
+"""query and template features -> one map each, by the trained head of the embedded model, with gradient histograms."""
 
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ TRAINED_ON = HEAD.with_suffix(".json")
 class Learned(Fuser[EncodedMap]):
     """Descriptors of a trained aggregation of all layers (after Luo et al., "Diffusion Hyperfeatures", NeurIPS 2023).
 
-    Layer 12, the crop's own gradient histograms, is appended with the weight ``edges``: descriptors distinguish
-    places, edges localise them. Without 12 among the ``layers`` the descriptors are used alone. Works only with the
-    features it was trained on: ``extract=embedded extract.weights=learned`` with its hook, timestep, noise and input
-    size.
+    Layer 12, gradient histograms of the crop, is appended with the weight ``edges``: descriptors distinguish places,
+    gradients localise them. Without 12 among the ``layers``, descriptors are used alone. Works only with the features
+    it was trained on: ``extract=embedded extract.weights=learned`` with its hook, timestep, noise and input size.
     """
 
     kind: ClassVar[str] = "fuse.learned"
@@ -60,11 +59,11 @@ class Learned(Fuser[EncodedMap]):
                 needed = f"{value!r}, as the head of fuse=learned was trained; or fuse=pca, as in method=dzop"
                 raise BadInput(f"extract.{name}", found=repr(recipe.get(name)), needed=needed)
         if self.layers not in (LAYERS, WITH_EDGES):
-            needed = f"{list(WITH_EDGES)} for fuse=learned, or {list(LAYERS)} without edges"
+            needed = f"{list(WITH_EDGES)} for fuse=learned, or {list(LAYERS)} without gradient histograms"
             raise BadInput("fuse.layers", found=list(self.layers), needed=needed)
 
     def recipe(self) -> dict[str, Any]:
-        """As Spec.recipe, with the digest of the head's weights; ``edges`` does not count where there are none."""
+        """As Spec.recipe, with the digest of the head's weights; ``edges`` is 0 without gradient histograms."""
         known = super().recipe() | {"weights": self.weights_digest}
         return known if EDGES in self.layers else known | {"edges": 0.0}
 

@@ -46,11 +46,11 @@ class Pca(Fuser[CropFeatures]):
             raise BadInput("fuse.dim", found=self.dim, needed=needed)
 
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> CropFeatures:
-        """The crop's features as they are: the axes depend on both images."""
+        """The crop's features, unchanged: the axes depend on both images."""
         return crop
 
     def pair(self, query: CropFeatures, template: CropFeatures) -> FusedPair:
-        """Fused maps; ``note`` says where the cells span fewer dimensions than ``dim``.
+        """Fused maps; ``note`` lists layers whose cells span fewer dimensions than ``dim``.
 
         Raises NoPose for an empty mask, features that are not finite, and features that are the same in all cells.
         """

@@ -35,7 +35,7 @@ class TemplatePca(Fuser[EncodedMap]):
         return Projection(layer=self.layers[0], dim=self.dim)
 
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> EncodedMap:
-        """The projected map; ``note`` says where the templates span fewer dimensions than ``dim``.
+        """The projected map; ``note`` is set if the templates span fewer dimensions than ``dim``.
 
         Raises NoPose for features that are not finite.
         """

@@ -28,7 +28,9 @@ class Poselib(RansacSolver):
 
     def __post_init__(self) -> None:
         if find_spec("poselib") is None:
-            raise BadInput("solve=poselib", found="no package poselib", needed="pip install 'dzop[poselib]'")
+            raise BadInput(
+                "solve=poselib", found="poselib, which is not installed", needed="pip install --editable '.[poselib]'"
+            )
 
     def ransac(
         self, points_obj: Float[np.ndarray, "m 3"], px_img: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"]
