@@ -51,6 +51,10 @@ class Bank:
         """Lengths of the flattened maps."""
         return map_norms(self.features)
 
+    def maps(self, layer: int) -> torch.Tensor:
+        """Features of the only layer that benchmarks match."""
+        return self.features
+
     def view(self, index: int) -> TemplateView:
         """Everything about one template."""
         return self.views[index]
