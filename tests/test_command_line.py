@@ -316,9 +316,10 @@ def test_a_refused_detection_names_the_values_of_its_own_file(dzop, tmp_path, ca
     entry = {"scene_id": 1, "image_id": 0, "category_id": 1, "score": 0.9, "time": 0.1}
     for name, bbox in (("short", [1, 2, 3]), ("flat", [1, 2, 0, 3])):
         Path("found.json").write_text(json.dumps([{**entry, "bbox": bbox}]))
-        dzop(f"store.root={cache}", "detect=json", "detect.path=found.json", "select.objects=[1]", f"out={name}")
-        answers = json.loads(next(tmp_path.glob(f"{name}/*/*/poses.json")).read_text())["answers"]
-        assert str(bbox) in answers[0]["reason"]
+        ran = dzop(f"store.root={cache}", "detect=json", "detect.path=found.json", "select.objects=[1]", f"out={name}")
+        assert ran.status == 1
+        assert str(bbox) in ran.err
+        assert not list(tmp_path.glob(f"{name}/*/*/poses.json"))
 
 
 def test_a_sweep_continues_after_a_failed_job_and_names_it_at_the_end(dzop, cache):

@@ -343,7 +343,9 @@ def test_dataset_yaml_lists_every_field_and_can_be_instantiated(name: str):
     values = yaml.safe_load((CONF / "dataset" / f"{name}.yaml").read_text())["dataset"]
     assert values.pop("_target_") == "pipeline.bop.dataset.DatasetConfig"
     config = build(DatasetConfig, values, where="dataset")
-    assert set(values) == {"name", "root", "split", "models", "targets"} | ({"sensor"} if name == "bop" else set())
+    assert set(values) == {"name", "root", "split", "models", "targets", "simplify"} | (
+        {"sensor"} if name == "bop" else set()
+    )
     assert config.name == (name if name != "bop" else "???")
 
 
