@@ -1,18 +1,23 @@
-"""Progress of a run: rows computed and reused per step, seconds per step, and progress bars."""
+"""Progress of a run: rows computed and reused per step, seconds per step, progress bars, and lines in log files."""
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from tqdm import tqdm
 
+LINE_EVERY_S = 30.0  # where stderr is no terminal, which would show a bar
+
 STEPS = (
     "templates",
     "template crops",
     "template features",
     "fits",
+    "template encodings",
     "proposals",
     "proposal features",
     "detections",
@@ -36,10 +41,14 @@ class StepCount:
 
 @dataclass
 class Progress:
-    """Counts per step, and progress bars. ``show_bars=False`` hides the bars; counting goes on."""
+    """Counts per step, and progress bars. ``show_bars=False`` hides the bars; counting goes on.
+
+    Where stderr is no terminal, a line every 30 s at most takes the place of all bars.
+    """
 
     show_bars: bool = True
     counts: dict[str, StepCount] = field(default_factory=dict)
+    _last_line: float = field(default_factory=time.monotonic, repr=False)
 
     def step(self, name: str) -> StepCount:
         """The counts of a step so far; zeros for a new one."""
@@ -59,12 +68,19 @@ class Progress:
 
     @contextmanager
     def bar(self, total: int, title: str, unit: str) -> Iterator[Callable[[int], None]]:
-        """Show a progress bar after three seconds; yields the function that advances it. No bar without a title."""
-        disable = None if self.show_bars and title else True  # None: tqdm hides it where stderr is no terminal
-        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=disable, dynamic_ncols=True) as bar:
+        """Show a progress bar after three seconds; yields the function that advances it. Nothing without a title."""
+        shown = self.show_bars and bool(title)
+        lines = shown and not sys.stderr.isatty()
+        done, start = 0, time.monotonic()
+        with tqdm(total=total, desc=title, unit=unit, delay=3, disable=lines or not shown, dynamic_ncols=True) as bar:
 
             def advance(rows: int) -> None:
+                nonlocal done
+                done += rows
                 bar.update(rows)
+                if lines and time.monotonic() - self._last_line >= LINE_EVERY_S:
+                    self._last_line = time.monotonic()
+                    print(progress_line(title, unit, done, total, self._last_line - start), file=sys.stderr, flush=True)
 
             yield advance
 
@@ -79,6 +95,19 @@ class Progress:
     def as_record(self) -> dict[str, dict[str, float]]:
         """The counts as JSON-able values."""
         return {step: {**vars(count), "time_s": round(count.time_s, 3)} for step, count in self.counts.items()}
+
+
+def progress_line(title: str, unit: str, done: int, total: int, elapsed_s: float) -> str:
+    """State of a bar as one line: rows done, their rate, and the time that the others take at this rate."""
+    left = format_duration((total - done) * elapsed_s / done) if done else "?"
+    return f"{title}: {done} of {total} {unit}s, {done / max(elapsed_s, 1e-9):.2g} per second, {left} left"
+
+
+def format_duration(seconds: float) -> str:
+    """Seconds as text in seconds, minutes or hours: ``1.5 min``."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def format_bytes(size: float) -> str:

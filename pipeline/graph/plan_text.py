@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipeline.graph.plan import KEY_DIGITS, Node
-from pipeline.progress import format_bytes
+from pipeline.progress import format_bytes, format_duration
 
 
 def plan_table(nodes: Sequence[Node]) -> str:
@@ -26,13 +26,6 @@ def plan_costs(nodes: Sequence[Node]) -> str:
     missing = [node for node in nodes if node.state != "cached"]
     passes = f"{sum(node.passes for node in missing)} images through the backbone"
     return f"disk    {_disk_text(missing)}\npasses  {passes}\ntime    {_time_text(missing)}"
-
-
-def format_duration(seconds: float) -> str:
-    """Seconds as text in seconds, minutes or hours: ``1.5 min``."""
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _disk_text(missing: Sequence[Node]) -> str:
