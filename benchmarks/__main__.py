@@ -14,6 +14,7 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
+from benchmarks.default_pose import default_pose
 from benchmarks.extraction import extraction, extraction_sd
 from benchmarks.jobs import memory, onboarding, warm
 from benchmarks.measure import Measurement, describe_machine, table
@@ -26,6 +27,7 @@ from pipeline.parallel import use_threads
 
 PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "online": online,
+    "pose": default_pose,
     "store": storing,
     "render": rendering,
     "extract": extraction,

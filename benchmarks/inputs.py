@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from pipeline.functional import rigid
-from pipeline.functional.similarity import map_norms
+from pipeline.functional.masks import cell_mask
+from pipeline.functional.similarity import cell_norms, map_norms
 from pipeline.graph.context import stack_crops
 from pipeline.items.features import CropFeatures, FittedArrays
 from pipeline.items.fit import Fit
@@ -54,6 +55,16 @@ class Bank:
     def maps(self, layer: int) -> torch.Tensor:
         """Features of the only layer that benchmarks match."""
         return self.features
+
+    @cached_property
+    def cell_norms(self) -> Float[Tensor, "n h w"]:
+        """Lengths of the cells."""
+        return cell_norms(self.features)
+
+    @cached_property
+    def cell_mask(self) -> Bool[Tensor, "n h w"]:
+        """Foreground cells."""
+        return cell_mask(self.mask, cells=self.features.shape[-1])
 
     def view(self, index: int) -> TemplateView:
         """Everything about one template."""

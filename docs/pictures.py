@@ -80,7 +80,16 @@ def run(folder: Path, *overrides: str, views: int) -> Path:
 def pose_card(folder: Path, *, views: int) -> PIL.Image.Image:
     """How the mug's pose came about. Without the rerender, so that the card shows a stored template."""
     chosen = [f"select.images=[{PHOTOGRAPH}]", f"select.objects=[{MUG}]"]
-    results = run(folder, "dataset=demo", *chosen, "second_look=none", "overlays=false", "gallery=1", views=views)
+    results = run(
+        folder,
+        "dataset=demo",
+        *chosen,
+        "second_look=none",
+        "cluster=kmeans",
+        "overlays=false",
+        "gallery=1",
+        views=views,
+    )
     return PIL.Image.open(next((results / "gallery").glob("*.jpg")))
 
 

@@ -14,9 +14,8 @@ from pydantic.dataclasses import is_pydantic_dataclass
 
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import NotDownloaded
-from pipeline.method import Stages
+from pipeline.method import SecondLook, Stages
 from pipeline.options import Evaluate, Options, Select
-from pipeline.route import SecondLook
 from pipeline.spec import build, did_you_mean
 
 PACKAGE = Path(__file__).resolve().parent
@@ -47,7 +46,7 @@ def build_stages(values: Mapping[str, Any]) -> Stages:
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
     second_look: SecondLook = build_variant(values["second_look"], "second_look")
-    return Stages(**stages, fallback=values["fallback"], second_look=second_look.hypotheses)
+    return Stages(**stages, fallback=values["fallback"], second_look=second_look)
 
 
 def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options:

@@ -30,6 +30,7 @@ def describe_machine(device: str = "cpu") -> dict[str, str]:
         "numpy": np.__version__,
         "scipy": scipy.__version__,
         "opencv": cv2.__version__,
+        "poselib": version("poselib"),
         "zarr": version("zarr"),
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else device,
         "cpu": f"{cpu_model()}, {torch.backends.cpu.get_cpu_capability()}",
@@ -50,6 +51,6 @@ def cpu_model() -> str:
 
 def machine_text(made_by: Mapping[str, str]) -> str:
     """A description in one line, without the threads, which change no result."""
-    libraries = ("dzop", "python", "torch", "numpy", "scipy", "opencv", "zarr")
+    libraries = ("dzop", "python", "torch", "numpy", "scipy", "opencv", "poselib", "zarr")
     parts = [f"{name} {made_by[name]}" for name in libraries if name in made_by]
     return ", ".join([*parts, f"on {made_by.get('device', '?')} ({made_by.get('cpu', '?')})"])

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from pipeline.fits import chain
 from pipeline.items.features import SALIENCY_LAYER
 from pipeline.items.fit import Fit
+from pipeline.spec import Fraction, NonNegative, NonNegativeFloat, Positive, Spec, spec
 from pipeline.stages.choose import HypothesisScorer
 from pipeline.stages.cluster import Clusterer
 from pipeline.stages.correspond import Corresponder
 from pipeline.stages.crop import Cropper
 from pipeline.stages.detect import Detector
 from pipeline.stages.extract import Extractor
-from pipeline.stages.fuse import Fuser
+from pipeline.stages.fuse import Fuser, coarse_shape
 from pipeline.stages.match import Matcher
 from pipeline.stages.refine import Refiner
 from pipeline.stages.render import Renderer
@@ -24,11 +25,32 @@ ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "r
 """The stages that a pose depends on besides the features."""
 
 
+@spec
+class SecondLook(Spec):
+    """Rerender (render and compare): how the best hypotheses are found and how many are rendered and matched again.
+
+    ``block``: side, in cells, of the blocks whose mean feature the first look compares; 1 for every cell. ``solved``:
+    hypotheses with most correspondences that the first look solves; 0 for all. ``hypotheses``: how many are rendered,
+    best first, and compared cell by cell; 0 for none. No hypothesis is rendered whose points lie, on average, within
+    ``apart`` times the crop's side of where a better one has them, and none after one with ``enough`` of its matches as
+    inliers.
+    """
+
+    kind: ClassVar[str] = "second look"
+    version: ClassVar[int] = 2
+
+    hypotheses: NonNegative = 0
+    block: Positive = 1
+    solved: NonNegative = 0
+    apart: NonNegativeFloat = 0.0
+    enough: Fraction = 1.0
+
+
 @dataclass(frozen=True)
 class Stages:
     """The variant of each stage.
 
-    ``fallback``: use the template's own pose where the solver fails. ``second_look``: hypotheses to rerender.
+    ``fallback``: use the template's own pose where the solver fails.
     """
 
     render: Renderer
@@ -43,7 +65,7 @@ class Stages:
     refine: Refiner
     detect: Detector
     fallback: bool = False
-    second_look: int = 0
+    second_look: SecondLook = field(default_factory=SecondLook)
 
     @property
     def oracle(self) -> str:
@@ -57,6 +79,18 @@ class Stages:
         """Layers that the route reads: for matching, for fusing, and saliency where a stage needs it."""
         saliency = {SALIENCY_LAYER} if self.correspond.needs_saliency else set()
         return tuple(sorted({*self.match.layers, *self.fuse.layers} | saliency))
+
+    @property
+    def encoding_shape(self) -> tuple[int, int, int] | None:
+        """(d, h, w) of a template's map as the first look compares it; None where such maps are not stored.
+
+        They are stored where they depend on the template alone and are coarser than what a view is compared by later.
+        """
+        block = self.second_look.block
+        if self.fuse.joint or block == 1:
+            return None
+        shape = self.fuse.encoded_shape({layer: self.extract.feature_shape(layer) for layer in self.fuse.layers})
+        return shape and coarse_shape(shape, block=block)
 
     @property
     def fits(self) -> tuple[Fit, ...]:

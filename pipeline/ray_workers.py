@@ -14,18 +14,16 @@ import sys
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from pipeline.errors import BadInput, DzopError
-from pipeline.graph import Context, Counts, Graph
-from pipeline.io.digests import track_files, tracked_digests
-from pipeline.parallel import use_threads
+from pipeline.graph import Context, Counts
 from pipeline.spec import NonNegative, Positive, Runtime, spec
-from pipeline.store import MemoryStoreConfig, Store
+from pipeline.store import MemoryStoreConfig
+from pipeline.worker import build_graph, worker_setup
 
 try:
     import ray
@@ -58,7 +56,7 @@ class RayRuntime(Runtime):
     retries: NonNegative = 3
 
     @contextmanager
-    def workers(self, run: Context, *, threads: int) -> Iterator[RayWorkers]:
+    def start_workers(self, run: Context, *, threads: int) -> Iterator[RayWorkers]:
         """Workers that start with the first item to compute and end with the block.
 
         Raises BadInput without Ray or with a store that workers cannot share, DzopError when the cluster fails.
@@ -135,7 +133,7 @@ class RayWorkers:
             _connect(self.runtime.address)
             self._connected = True
             self._max_workers = self._fit_workers()
-            self._setup = ray.put(_worker_setup(self.run, self.runtime, self.threads))
+            self._setup = ray.put(worker_setup(self.run, self.runtime, self.threads or self.runtime.cpus_per_actor))
         for _ in range(min(items, self._max_workers) - len(self._idle) - len(self._starting)):
             self._start_worker()
 
@@ -211,7 +209,7 @@ class Worker:
     def __init__(self, setup: dict[str, Any]) -> None:
         self.error, self.graph = "", None
         try:
-            self.graph = _build_graph(**setup)
+            self.graph = build_graph(**setup)
         except DzopError as error:
             self.error = str(error)
 
@@ -226,35 +224,6 @@ class Worker:
             return self.graph.run_item(task, item), ""
         except DzopError as error:
             return {}, str(error)
-
-
-def _worker_setup(run: Context, runtime: RayRuntime, threads: int) -> dict[str, Any]:
-    """Arguments of ``_build_graph`` that are sent to a worker."""
-    local = Runtime(**{f.name: getattr(runtime, f.name) for f in fields(Runtime)})
-    return {
-        "run": (run.stages, run.dataset, run.targets, run.store.config),
-        "runtime": replace(local, progress=False),
-        "threads": threads or runtime.cpus_per_actor,
-        "folder": os.getcwd(),
-        "digests": tracked_digests(),
-        "lease": run.store.lease.name if run.store.lease else "",
-    }
-
-
-def _build_graph(
-    run: tuple[Any, ...], runtime: Runtime, threads: int, folder: str, digests: dict[str, str], lease: str
-) -> Graph:
-    if os.path.isdir(folder):
-        os.chdir(folder)  # paths in the configuration may be relative
-    track_files(known=digests).__enter__()  # as long as this process lives: a worker serves one run
-    use_threads(threads)
-    stages, dataset, targets, config = run
-    store = Store(config)
-    store.join_lease(lease)
-    graph = Graph(Context(stages, dataset, targets, store, runtime))
-    graph.check()
-    graph.limit_vram()
-    return graph
 
 
 # --- connecting -------------------------------------------------------------------------------------------------------

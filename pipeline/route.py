@@ -19,29 +19,23 @@ from torch import Tensor
 
 from pipeline.errors import NoPose
 from pipeline.functional import camera, rigid
-from pipeline.functional.crop_pose import pose_in_image, transfer_template_pose
+from pipeline.functional.crop_pose import pose_in_image
 from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
 from pipeline.functional.pnp import reprojection_error_px
-from pipeline.items.features import SALIENCY_LAYER, Clusters, FittedArrays, FusedPair, PairGeometry
+from pipeline.hypotheses import is_convincing, select_distinct, select_matched
+from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair, PairGeometry
 from pipeline.items.matches import Correspondences, TrueMatches
 from pipeline.items.online import Clock, Hypothesis, Query, TemplateBank, TemplateView, Trace
 from pipeline.items.poses import PoseSolution
 from pipeline.method import Stages
-from pipeline.spec import NonNegative, spec
 from pipeline.stages.cluster import require_cells
+from pipeline.stages.fuse import coarsen_pair, encode_view
 from pipeline.stages.lift import lift
 from pipeline.stages.solve import Plane
 
 MIN_POINTS = 4
 LARGEST_CROP_PX = 160  # side, in image pixels, of the largest crop whose solver threshold is in image pixels
-
-
-@spec
-class SecondLook:
-    """Rerender (render and compare): how many of the best hypotheses are rendered and matched again; 0 for none."""
-
-    hypotheses: NonNegative = 0
 
 
 def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
@@ -53,21 +47,13 @@ def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     with route.clock("match"):
         match = stages.match(query, bank)
     candidates = zip(match.index.tolist(), match.score.tolist(), strict=True)
-    hypotheses = route.sort([route.solve(Hypothesis(index, score)) for index, score in candidates])
-    if stages.second_look:
-        count = min(stages.second_look, len(hypotheses))
-        hypotheses[:count] = route.sort([route.rerender(h) for h in hypotheses[:count]])
+    compared = [route.compare(Hypothesis(index, score)) for index, score in candidates]
+    matched = select_matched(compared, count=stages.second_look.solved)
+    hypotheses = route.sort([route.solve(h) for h in matched])
+    if stages.second_look.hypotheses:
+        hypotheses = route.look_again(hypotheses)
     hypotheses[0] = route.refine(hypotheses[0])
     return Trace(match, tuple(hypotheses), route.clock.times_s)
-
-
-def replay_hypothesis(stages: Stages, query: Query, bank: TemplateBank, template_id: int, score: float) -> Hypothesis:
-    """Repeat what the trace of this query did with one template: the hypothesis that it chose, refined."""
-    route = Route(stages, query, bank)
-    hypothesis = route.solve(Hypothesis(template_id, score))
-    if stages.second_look:
-        hypothesis = route.rerender(hypothesis)
-    return route.refine(hypothesis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +65,8 @@ class Route:
     bank: TemplateBank
     clock: Clock = field(default_factory=Clock)
 
-    def solve(self, start: Hypothesis) -> Hypothesis:
-        """Estimate the pose of a hypothesis from its template, or record why it has none."""
+    def compare(self, start: Hypothesis) -> Hypothesis:
+        """Find the correspondences of a hypothesis, or record why it has none."""
         parts: dict[str, Any] = {}
         try:
             with self.clock("read template"):
@@ -90,14 +76,34 @@ class Route:
             with self.clock("cluster"):
                 clusters = parts["clusters"] = self.cluster(template, pair)
             with self.clock("correspond"):
-                matches = parts["matches"] = self.correspond(template, pair, clusters)
+                parts["matches"] = self.correspond(template, pair, clusters)
+        except NoPose as failure:
+            parts["failure"] = failure
+        return replace(start, **parts)
+
+    def solve(self, start: Hypothesis) -> Hypothesis:
+        """Estimate the pose of a hypothesis from its correspondences, or record why it has none."""
+        if start.matches is None:
+            return start
+        parts: dict[str, Any] = {}
+        try:
             with self.clock("lift"):
-                parts["points_obj"], parts["query_px_img"] = self.lift(template, matches)
+                parts["points_obj"], parts["query_px_img"] = self.lift(self.view(start), start.matches)
             with self.clock("solve"):
                 parts["solution"] = self.solve_pose(parts["points_obj"], parts["query_px_img"])
         except NoPose as failure:
             parts["failure"] = failure
         return replace(start, **parts)
+
+    def look_again(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Rerender distinct hypotheses, best first, until one convinces."""
+        look, K_crop, seen = self.stages.second_look, self.query.K_crop, dict[Hypothesis, Hypothesis]()
+        apart_px = look.apart * self.stages.crop.size
+        for h in select_distinct(hypotheses, K_crop, count=look.hypotheses, apart_px=apart_px):
+            seen[h] = self.rerender(h)
+            if is_convincing(seen[h], share=look.enough):
+                break
+        return [*self.sort(list(seen.values())), *(h for h in hypotheses if h not in seen)]
 
     def rerender(self, first: Hypothesis) -> Hypothesis:
         """Match again with a view rendered in the hypothesis's pose; the first hypothesis where that fails.
@@ -109,7 +115,7 @@ class Route:
             return first
         with self.clock("draw"):
             view = self.bank.draw(first.solution.T_cam_obj, self.query.A_crop_img, self.query.K)
-        second = self.solve(Hypothesis(first.template_id, first.template_score, rerendered=view))
+        second = self.solve(self.compare(Hypothesis(first.template_id, first.template_score, rerendered=view)))
         return first if second.solution is None else second
 
     def view(self, hypothesis: Hypothesis) -> TemplateView:
@@ -118,19 +124,25 @@ class Route:
 
     def fuse(self, template: TemplateView) -> FusedPair:
         """Maps of query and template in one space, with saliency where the extractor gave it."""
-        fuse, fit = self.stages.fuse, self.stages.fuse.fit
-        fitted: FittedArrays = {} if fit is None else self.bank.fitted(fit)
-        query = self.query.memo.get(fuse, lambda: fuse.encode(self.query.crop, fitted))
-        pair = fuse.pair(query, template.memo.get(fuse, lambda: fuse.encode(template.crop, fitted)))
+        fuse, block = self.stages.fuse, self.block(template)
+        if fuse.joint:
+            pair = coarsen_pair(fuse.pair(self.query.crop, template.crop), block=block)
+        else:
+            views = (self.query, template)
+            pair = fuse.pair(*(encode_view(view, fuse, self.bank.fitted, block=block) for view in views))
         if SALIENCY_LAYER not in self.query.crop.maps:
             return pair
         cells = pair.query.shape[-1]
         salient = [upsample(x.crop.maps[SALIENCY_LAYER].float(), cells=cells)[0] for x in (self.query, template)]
         return replace(pair, query_saliency=salient[0], template_saliency=salient[1])
 
+    def block(self, template: TemplateView) -> int:
+        """Side of the blocks of cells that are compared: 1 for a view that was rendered for this query."""
+        return 1 if template.rgb is not None else self.stages.second_look.block
+
     def cluster(self, template: TemplateView, pair: FusedPair) -> Clusters:
         """Clusters of both maps, each computed once where its map does not depend on the other image."""
-        cluster, key = self.stages.cluster, (self.stages.fuse, self.stages.cluster)
+        cluster, key = self.stages.cluster, (self.stages.fuse, self.stages.cluster, self.block(template))
         if self.stages.fuse.joint:
             return cluster(pair)
         require_cells(pair)
@@ -234,8 +246,3 @@ def solver_plane(
     side_px = crop_size / float(camera.local_zoom(query.A_crop_img, centre)[0])
     A_plane_img = camera.resize_affine(min(1.0, LARGEST_CROP_PX / side_px))
     return A_plane_img, A_plane_img @ query.K, np.eye(3)
-
-
-def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:
-    """T_cam_obj (mm) from a template alone: its rotation, with the place and scale of the query's crop."""
-    return transfer_template_pose(query.A_crop_img, query.K, template.A_crop_img, template.K, template.T_cam_obj)

@@ -58,7 +58,7 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     with track_files(None if folder is None else DigestCache(folder / ".digests")):
         data = dataset.open()
         context = Context(stages, data, options.select.targets(data), store, runtime, Progress(runtime.progress))
-        with store.in_use(), runtime.workers(context, threads=options.threads) as context.workers:
+        with store.in_use(), runtime.start_workers(context, threads=options.threads) as context.workers:
             graph = Graph(context)
             if options.plan:
                 _print_plan(graph, options)

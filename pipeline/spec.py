@@ -206,7 +206,7 @@ class Runtime:
         """``max_memory`` in bytes. Raises BadInput if it is not a size."""
         return _parse_size(self.max_memory, "runtime.max_memory")
 
-    def workers(self, run: Any, *, threads: int) -> AbstractContextManager[Any]:
+    def start_workers(self, run: Any, *, threads: int) -> AbstractContextManager[Any]:
         """Worker processes for a run; None means this process computes everything. ``threads`` per process, 0 = all."""
         return nullcontext()
 

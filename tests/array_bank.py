@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from pipeline.fits import fit_arrays, foreground_cells
-from pipeline.functional.similarity import map_norms
+from pipeline.functional.masks import cell_mask
+from pipeline.functional.similarity import cell_norms, map_norms
 from pipeline.items.features import CropFeatures
 from pipeline.items.online import Query, TemplateView, Truth
 
@@ -27,6 +28,14 @@ class ArrayBank:
 
     def maps(self, layer: int) -> torch.Tensor:
         return self.features
+
+    @cached_property
+    def cell_norms(self) -> torch.Tensor:
+        return cell_norms(self.features)
+
+    @cached_property
+    def cell_mask(self) -> torch.Tensor:
+        return cell_mask(self.mask, cells=self.features.shape[-1])
 
     def view(self, index: int) -> TemplateView:
         return self.views[index]

@@ -8,9 +8,12 @@ import torch
 
 from benchmarks.presets import PAPER
 from pipeline.functional import camera, rigid
+from pipeline.hypotheses import select_distinct, template_pose
 from pipeline.items.features import CropFeatures
-from pipeline.items.online import Query, TemplateView
-from pipeline.route import Route, template_pose
+from pipeline.items.online import Hypothesis, Query, TemplateView
+from pipeline.items.poses import PoseSolution
+from pipeline.method import SecondLook
+from pipeline.route import Route
 from pipeline.stages.solve.epnp import Epnp
 from pipeline.stages.solve.poselib import Poselib
 
@@ -93,3 +96,26 @@ def test_a_template_in_a_square_crop_keeps_its_place_and_its_size():
     ]
     np.testing.assert_allclose(*at, atol=1e-9)
     assert found[2, 3] == pytest.approx(700 * CROPS["square"][0, 0] / A_template[0, 0])
+
+
+def hypothesis(T_cam_obj: np.ndarray) -> Hypothesis:
+    points = np.random.default_rng(0).uniform(-60, 60, (80, 3))
+    return Hypothesis(0, 1.0, points_obj=points, solution=PoseSolution(T_cam_obj, np.ones(80, bool), 0.5))
+
+
+@pytest.mark.parametrize(("apart_px", "chosen"), [(5.0, [0, 2]), (0.0, [0, 1]), (128.0, [0, 4])])
+def test_hypotheses_that_would_render_nearly_the_same_view_are_selected_once(apart_px, chosen):
+    turned = T @ rigid.rigid(rigid.rotation_between(np.array([0.0, 0, 1]), np.array([1.0, 0, 1])), np.zeros(3))
+    shifted, behind = T.copy(), T.copy()
+    shifted[0, 3] += 3.0  # mm, about 3 px of 128
+    behind[2, 3] = -500.0
+    poses = [hypothesis(pose) for pose in (T, shifted, turned, shifted)] + [hypothesis(behind)]
+    found = select_distinct(poses, CROPS["square"] @ K, count=2, apart_px=apart_px)
+    assert [poses.index(h) for h in found] == chosen
+
+
+def test_of_hypotheses_without_a_pose_none_looks_like_another():
+    without = [Hypothesis(k, 1.0) for k in range(3)]
+    assert select_distinct(without, CROPS["square"] @ K, count=2, apart_px=5.0) == without[:2]
+    route = Route(replace(PAPER, second_look=SecondLook(hypotheses=2)), Query(NOTHING, CROPS["square"], K), bank=None)
+    assert [h.template_id for h in route.look_again(without)] == [0, 1, 2]

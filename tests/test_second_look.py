@@ -12,13 +12,16 @@ from pipeline.functional import camera, rigid
 from pipeline.functional.masks import foreground
 from pipeline.graph import Context, Graph
 from pipeline.items.poses import PoseEstimate
+from pipeline.method import SecondLook
 from pipeline.route import trace_pose
 from pipeline.spec import Runtime
 from pipeline.stages.choose.agreement import Agreement
 from pipeline.stages.cluster.kmeans import KMeans
+from pipeline.stages.cluster.one import One
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
 from pipeline.stages.extract.embedded import Embedded
+from pipeline.stages.fuse import coarsen
 from pipeline.stages.fuse.concat import Concat
 from pipeline.stages.fuse.learned import Learned
 from pipeline.stages.lift import lift
@@ -35,8 +38,8 @@ STAGES = replace(
     match=MaskedCosine(top_k=3),
     fuse=Concat(layers=(8, 11)),
     choose=Agreement(),
-    refine=Featuremetric(),
-    second_look=2,
+    refine=Featuremetric(sigmas_cells=(2.0, 1.0, 0.0), max_points=1000),
+    second_look=SecondLook(hypotheses=2),
 )
 
 
@@ -90,7 +93,7 @@ def test_a_drawn_view_shows_the_object_where_the_querys_crop_would(scenes, cache
 def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes, cache):
     errors = {}
     for looks in (0, 2):
-        made = graph(scenes, cache, second_look=looks)
+        made = graph(scenes, cache, second_look=SecondLook(hypotheses=looks))
         answers, off = estimates(made), []
         for answer in answers:
             (true,) = [g for g in scenes.ground_truth(answer.scene_id, answer.im_id) if g.gt_id == answer.gt_id]
@@ -107,12 +110,12 @@ def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes,
 
 
 def test_poses_of_another_number_of_looks_have_keys_of_their_own(scenes, cache):
-    keys = {n: graph(scenes, cache, second_look=n).poses.run_ref().key for n in (0, 1, 2)}
+    keys = {n: graph(scenes, cache, second_look=SecondLook(hypotheses=n)).poses.run_ref().key for n in (0, 1, 2)}
     assert len(set(keys.values())) == 3
 
 
 def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache):
-    made = graph(scenes, cache, second_look=1)
+    made = graph(scenes, cache, second_look=SecondLook(hypotheses=1))
     made.onboard()
     found = made.queries.make_crops(scenes.images[0])
     made.queries.make_features(scenes.images[0], found)
@@ -121,7 +124,7 @@ def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache
     nothing = bank.draw(behind, query.A_crop_img, query.K)
     assert not nothing.crop.mask.any()
     kept = trace_pose(made.context.stages, query, replace(bank, draw=lambda *pose: nothing)).best
-    first = trace_pose(replace(made.context.stages, second_look=0), query, bank).best
+    first = trace_pose(replace(made.context.stages, second_look=SecondLook()), query, bank).best
     assert kept.rerendered is None
     np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)
 
@@ -153,7 +156,55 @@ def test_maps_that_are_encoded_independently_are_clustered_once(scenes, cache, m
 
 
 def test_a_plan_counts_the_passes_of_second_looks(scenes, cache):
-    made = graph(scenes, cache, second_look=3)
+    made = graph(scenes, cache, second_look=SecondLook(hypotheses=3))
     made.detect()
     nodes = [node for node in made.plan() if node.step == "poses"]
     assert sum(node.passes for node in nodes) == 3 * len(scenes.targets)
+
+
+@pytest.fixture(scope="module")
+def encoded(scenes, tmp_path_factory) -> Graph:
+    look = SecondLook(hypotheses=1, block=2, solved=2)
+    chosen = {"extract": Embedded(), "match": MaskedCosine(top_k=4), "fuse": Learned(), "cluster": One()}
+    render = Raycast(viewpoints="superfibonacci", count=12)
+    return graph(scenes, tmp_path_factory.mktemp("encoded"), render=render, second_look=look, **chosen)
+
+
+def test_encodings_of_templates_take_the_planned_bytes_and_are_read_back(encoded):
+    encoded.detect()
+    planned = {node.ref: node.nbytes for node in encoded.plan() if node.step == "template encodings"}
+    encoded.onboard()
+    assert len(planned) == 2
+    assert planned == {ref: encoded.context.store.size(ref) for ref in planned}
+    view = encoded.templates.bank(1).view(3)
+    stored, made = view.read_encoding(), coarsen(Learned().encode(view.crop, {}), block=2)
+    assert torch.equal(stored.mask, made.mask)
+    torch.testing.assert_close(stored.features, made.features, atol=2e-3, rtol=1e-3)  # float16
+    assert {node.state for node in encoded.plan() if node.step == "template encodings"} == {"cached"}
+
+
+def test_the_first_look_solves_the_hypotheses_with_most_matches_on_coarse_maps(encoded, scenes, monkeypatch):
+    encoded.onboard()
+    found = encoded.queries.make_crops(scenes.images[0])
+    encoded.queries.make_features(scenes.images[0], found)
+    query, bank = encoded.poses.query(found[0])[0], encoded.templates.bank(found[0].detection.obj_id)
+    calls, encode = [], Learned.encode
+    monkeypatch.setattr(Learned, "encode", lambda self, *args: calls.append(0) or encode(self, *args))
+    trace = trace_pose(encoded.context.stages, query, bank)
+    assert len(calls) == 2  # the query and the rendered view, no template
+    everything = replace(encoded.context.stages, second_look=SecondLook(hypotheses=1, block=2))
+    more = trace_pose(everything, replace(query), bank).hypotheses
+    assert (len(trace.hypotheses), len(more)) == (2, 4)
+    best, other = trace.hypotheses
+    assert (best.pair.query.shape[-1], other.pair.query.shape[-1]) == (64, 32)
+    matches = sorted((len(h.matches.similarity) for h in more if h.rerendered is None), reverse=True)
+    assert len(other.matches.similarity) in matches[:2]
+    again = trace_pose(encoded.context.stages, replace(query), bank)
+    np.testing.assert_array_equal(again.best.solution.T_cam_obj, best.solution.T_cam_obj)
+
+
+def test_a_joint_fuse_is_coarsened_after_it_and_stores_nothing(scenes, cache):
+    look = SecondLook(hypotheses=1, block=2)
+    made = graph(scenes, cache, render=Raycast(viewpoints="superfibonacci", count=12), second_look=look)
+    assert estimates(made)
+    assert made.templates.encodings(1) is None

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 ORIENTATIONS, CONTRAST = 8, 0.02
+NEIGHBOURHOOD = 9  # cells whose histograms append_edges concatenates
 EDGES = 12  # layer number of the edge histograms, after the decoder's 0 to 11
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import avg_pool2d, interpolate, normalize
 
 
 def upsample(features: Float[Tensor, "c h w"], *, cells: int) -> Float[Tensor, "c cells_y cells_x"]:
@@ -13,6 +13,23 @@ def upsample(features: Float[Tensor, "c h w"], *, cells: int) -> Float[Tensor, "
     if features.shape[-1] == cells:
         return features
     return interpolate(features[None], size=(cells, cells), mode="bilinear", align_corners=False)[0]
+
+
+def block_means(
+    features: Float[Tensor, "c h w"], mask: Bool[Tensor, "h w"], *, block: int
+) -> tuple[Float[Tensor, "c y x"], Bool[Tensor, "y x"]]:
+    """Mean feature of the foreground cells of each ``block`` x ``block`` square of cells, and the foreground squares.
+
+    A square is foreground where at least half of its cells are, or, if there is no such square, where any cell is.
+    ``block`` must divide the map's sides.
+    """
+    inside = mask.to(features.dtype)
+    share = avg_pool2d(inside[None], block)
+    total = avg_pool2d((features * inside)[None], block)[0]
+    covered = share[0] >= 0.5
+    if not covered.any():
+        covered = share[0] > 0
+    return total / share.clamp(min=torch.finfo(features.dtype).tiny), covered
 
 
 def root_mean_square_norm(samples: Float[Tensor, "m c"]) -> Float[Tensor, ""]:

@@ -200,7 +200,7 @@ class Context:
     def maps(self, crops: Crops, layers: Sequence[int]) -> dict[int, np.ndarray]:
         """Feature maps of crops by layer, float16 on the CPU, as they are stored."""
         maps = self.backbone(crops, layers)
-        return {layer: _to_half(maps[layer], layer) for layer in layers}
+        return {layer: to_half(maps[layer], f"layer {layer}: features") for layer in layers}
 
 
 def stack_crops(crops: Sequence[Crop]) -> dict[str, np.ndarray]:
@@ -214,10 +214,10 @@ def _mesh_bytes(model: ObjectModel) -> int:
     return sum(array.nbytes for array in arrays if array is not None)
 
 
-def _to_half(maps: torch.Tensor, layer: int) -> np.ndarray:
+def to_half(maps: torch.Tensor, what: str) -> np.ndarray:
     """Convert to float16 on the CPU. Raises DzopError on overflow: infinite features would give wrong poses."""
     half = maps.half()
     if not torch.isfinite(half).all():
         needed = "try extract.dtype=float32 or another layer"
-        raise DzopError(f"layer {layer}: features are not finite in float16; {needed}")
+        raise DzopError(f"{what} are not finite in float16; {needed}")
     return half.cpu().numpy()

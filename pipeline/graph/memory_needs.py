@@ -72,9 +72,15 @@ def estimate_needs(context: Context, proposals: ProposalNodes | None) -> MemoryN
         bank=_bank_bytes(stages, shapes, n),
         view=HALF_BYTES * sum(map_values.values()) + encoded + crop_pixels + FLOAT_BYTES * h * w,
         online=FUSED_VALUE_BYTES * fused_values,
-        rerender=RERENDER_SCALE**2 * crop_pixels * (VIEW_PIXEL_BYTES + 2 * RAY_BYTES) if stages.second_look else 0,
+        rerender=_rerender_bytes(stages),
         unknown=unknown,
     )
+
+
+def _rerender_bytes(stages: Stages) -> int:
+    """The picture of a hypothesis and its rays."""
+    pixels = (RERENDER_SCALE * stages.crop.size) ** 2
+    return pixels * (VIEW_PIXEL_BYTES + 2 * RAY_BYTES) if stages.second_look.hypotheses else 0
 
 
 def _values(shape: Shape) -> int:

@@ -92,6 +92,10 @@ class Plan:
             nbytes = fit.array_bytes(stages.extract.feature_shape(fit.layer)[0], n)
             timing = timing_key("fits", stages)
             yield self._node("fits", f"{of} {fit.kind}", ref, nbytes, f"{n} templates", timing, share)
+        if (encodings := self.templates.encodings(obj_id)) is not None:
+            timing = timing_key("template encodings", stages)
+            nbytes = _total_bytes(self.templates.encodings_layout(), n)
+            yield self._node("template encodings", of, encodings, nbytes, f"{n} templates", timing, n)
 
     def _proposal_nodes(self, proposals: ProposalNodes) -> Iterator[Node]:
         """The detections and what they are computed from."""
@@ -125,7 +129,7 @@ class Plan:
         for (scene_id, obj_id), targets in self.poses.groups.items():
             n, of, stages = len(targets), f"scene {scene_id} object {obj_id}", self.context.stages
             timing = timing_key("poses", stages, rows=self._count_views(obj_id))
-            ref, passes = self.poses.poses((scene_id, obj_id)), n * stages.second_look
+            ref, passes = self.poses.poses((scene_id, obj_id)), n * stages.second_look.hypotheses
             yield self._node("poses", of, ref, None, f"{n} targets", timing, n, passes)
 
     def _feature_nodes(

@@ -13,12 +13,13 @@ from pipeline.graph.queries import CroppedDetection, QueryNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import StoredBank, TemplateNodes
 from pipeline.graph.timings import timing_key
+from pipeline.hypotheses import template_pose
 from pipeline.items.online import Query, Trace, Truth
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
 from pipeline.method import ONLINE_STAGES
-from pipeline.route import template_pose, trace_pose
+from pipeline.route import trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
@@ -50,13 +51,15 @@ class PoseNodes:
         stages, (_, obj_id) = self.context.stages, group
         recipe = {"kind": "poses", "version": POSES_VERSION, "fallback": stages.fallback}
         recipe |= {name: getattr(stages, name).recipe() for name in ONLINE_STAGES}
-        if stages.second_look:  # renderer and extractor are in the keys of the templates and their features
-            recipe["second look"] = stages.second_look
+        if stages.second_look.hypotheses:  # renderer and extractor are in the keys of the templates and their features
+            recipe["second look"] = stages.second_look.recipe()
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
             inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key
         for n, fit in enumerate(stages.fits):
             inputs[f"fit {n}"] = self.templates.fitted(obj_id, fit).key
+        if (encodings := self.templates.encodings(obj_id)) is not None:
+            inputs["template encodings"] = encodings.key
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.context.K(image).tolist()]

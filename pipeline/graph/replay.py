@@ -11,11 +11,10 @@ from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.online import Hypothesis
-from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.parallel import one_thread_per_kernel
-from pipeline.route import replay_hypothesis
+from pipeline.route import trace_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +48,8 @@ class Replayer:
         query_rgb = context.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
         if answer.template_id is None:
             return Replay(detection, query_rgb)
-        score = answer.template_score if isinstance(answer, PoseEstimate) else 0.0
         bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
-        hypothesis = replay_hypothesis(context.stages, query, bank, answer.template_id, score)
+        hypothesis = trace_pose(context.stages, query, bank).best
         if hypothesis.rerendered is not None:
             return Replay(detection, query_rgb, hypothesis.rerendered.rgb, hypothesis)
         crops = context.store.read(self.templates.crops(answer.obj_id))

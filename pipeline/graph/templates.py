@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, cached_property, lru_cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,19 +15,22 @@ from jaxtyping import Float
 from pipeline.errors import DzopError
 from pipeline.fits import chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
+from pipeline.functional.masks import cell_mask
 from pipeline.functional.resample import resample
 from pipeline.functional.rigid import rigid
-from pipeline.functional.similarity import map_norms
-from pipeline.graph.context import Context, stack_crops
+from pipeline.functional.similarity import cell_norms, map_norms
+from pipeline.graph.context import Context, stack_crops, to_half
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
 from pipeline.items.features import CropFeatures, FittedArrays, TemplateCells
 from pipeline.items.fit import Fit
 from pipeline.items.objects import MeshFacts
-from pipeline.items.online import TemplateView
+from pipeline.items.online import LazyView, TemplateView
 from pipeline.items.views import Crops, Geometry, Templates
+from pipeline.parallel import ordered_map
 from pipeline.stages.crop import HALF
-from pipeline.store import Layout, Ref, make_ref
+from pipeline.stages.fuse import EncodedMap, coarsen
+from pipeline.store import Entry, Layout, Ref, make_ref
 
 VIEWS_PER_BATCH = 8
 CROPS_PER_BATCH = 50
@@ -57,6 +61,16 @@ class StoredBank:
     def norms(self) -> torch.Tensor:
         """L2 norms of the flattened maps, float32; computed on first use."""
         return map_norms(self.features)
+
+    @cached_property
+    def cell_norms(self) -> torch.Tensor:
+        """Lengths of the cells, float32; computed when a matcher first asks."""
+        return cell_norms(self.features)
+
+    @cached_property
+    def cell_mask(self) -> torch.Tensor:
+        """Foreground cells; computed when a matcher first asks."""
+        return cell_mask(self.mask, cells=self.features.shape[-1])
 
     @cached_property
     def mask(self) -> torch.Tensor:
@@ -222,6 +236,51 @@ class TemplateNodes:
             arrays |= {name: torch.from_numpy(entry.array(name)[0]).to(device) for name in entry.arrays}
         return arrays
 
+    def encodings(self, obj_id: int) -> Ref | None:
+        """An object's templates as the first look compares them; None where they are not stored."""
+        stages = self.context.stages
+        if stages.encoding_shape is None:
+            return None
+        recipe = {"kind": "encodings", "fuse": stages.fuse.recipe(), "block": stages.second_look.block}
+        inputs = {f"layer {layer}": self.features(obj_id, layer).key for layer in stages.fuse.layers}
+        inputs |= {"crops": self.crops(obj_id).key}
+        if stages.fuse.fit is not None:
+            inputs["fit"] = self.fitted(obj_id, stages.fuse.fit).key
+        return make_ref("encodings", recipe, inputs)
+
+    def encodings_layout(self) -> dict[str, Layout]:
+        """Arrays of an encodings entry: the map, channels last, and the mask of its foreground as one more channel."""
+        assert self.context.stages.encoding_shape is not None
+        d, h, w = self.context.stages.encoding_shape
+        return {"maps": Layout((h, w, d + 1), "float16")}
+
+    def make_encodings(self, obj_id: int, count: int) -> None:
+        """Encode an object's templates for the first look, where that is missing."""
+        ref, stages = self.encodings(obj_id), self.context.stages
+        if ref is None:
+            return
+        fuse, block = stages.fuse, stages.second_look.block
+
+        @cache
+        def inputs() -> tuple[tuple[dict[int, Entry], Entry, Entry], FittedArrays]:
+            fitted = {} if fuse.fit is None else self.read_fitted(obj_id, fuse.fit, device=self.context.device)
+            return self._open(obj_id), fitted
+
+        def encode(crop: CropFeatures) -> np.ndarray:
+            encoded = coarsen(fuse.encode(crop, inputs()[1]), block=block)
+            maps = torch.cat([encoded.features, encoded.mask[None]]).movedim(0, -1).contiguous()
+            return to_half(maps, "encodings of templates")
+
+        def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
+            crops = [self._readers(*inputs()[0], row)["crop"]() for row in rows]
+            return {ref.key: {"maps": np.stack(list(ordered_map(encode, crops)))}}
+
+        timing = timing_key("template encodings", stages)
+        layouts = {ref: self.encodings_layout()}
+        self.context.fill(
+            "template encodings", f"encode object {obj_id}", layouts, count, VIEWS_PER_BATCH, compute, timing=timing
+        )
+
     def _cells(self, obj_id: int, layer: int) -> TemplateCells:
         """Features of the foreground cells of an object's templates, float16; maps are read in batches."""
         maps, crops = self.context.store.read(self.features(obj_id, layer)), self.context.store.read(self.crops(obj_id))
@@ -242,6 +301,7 @@ class TemplateNodes:
         refs = [self.templates(obj_id), self.crops(obj_id)]
         refs += [self.features(obj_id, layer) for layer in self.context.stages.layers]
         refs += [self.fitted(obj_id, fit) for fit in self.context.stages.fits]
+        refs += [ref for ref in [self.encodings(obj_id)] if ref is not None]
         return all(map(self.context.store.is_complete, refs))
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
@@ -250,6 +310,7 @@ class TemplateNodes:
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.context.stages.layers)
         self.make_fitted(obj_id)
+        self.make_encodings(obj_id, count)
         advance(1)
 
     def feature_bytes(self) -> int:
@@ -265,23 +326,17 @@ class TemplateNodes:
         return lru_cache(maxsize=1)(self._bank)
 
     def _bank(self, obj_id: int) -> StoredBank:
-        layers = self.context.stages.layers
-        features = {layer: self.context.store.read(self.features(obj_id, layer)) for layer in layers}
-        crops, templates = self.context.store.read(self.crops(obj_id)), self.context.store.read(self.templates(obj_id))
+        features, crops, templates = self._open(obj_id)
+        encodings = self.encodings(obj_id)
+        encoded = None if encodings is None else self.context.store.read(encodings)
         K = np.array(templates.document["K"])
 
         @lru_cache(maxsize=self.views)
         def view(index: int) -> TemplateView:
-            return TemplateView(
-                crop=CropFeatures(
-                    {layer: self.context.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()},
-                    self.context.tensor(crops.array("mask", [index])[0]),
-                ),
-                A_crop_img=crops.array("A_crop_img", [index])[0],
-                depth_mm=templates.array("depth_mm", [index])[0],
-                K=K,
-                T_cam_obj=templates.array("T_cam_obj", [index])[0],
-            )
+            read = self._readers(features, crops, templates, index)
+            if encoded is not None:
+                read["encoding"] = partial(self._read_encoding, encoded, index)
+            return LazyView(K, read)
 
         @lru_cache(maxsize=4)
         def fitted(fit: Fit) -> FittedArrays:
@@ -300,6 +355,32 @@ class TemplateNodes:
             poses=lambda: templates.array("T_cam_obj"),
             fitted=fitted,
         )
+
+    def _open(self, obj_id: int) -> tuple[dict[int, Entry], Entry, Entry]:
+        """Entries of an object's features by layer, its crops and its templates."""
+        read = self.context.store.read
+        features = {layer: read(self.features(obj_id, layer)) for layer in self.context.stages.layers}
+        return features, read(self.crops(obj_id)), read(self.templates(obj_id))
+
+    def _readers(
+        self, features: Mapping[int, Entry], crops: Entry, templates: Entry, index: int
+    ) -> dict[str, Callable[[], Any]]:
+        """How to read each field of a template."""
+
+        def read_crop() -> CropFeatures:
+            maps = {layer: self.context.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()}
+            return CropFeatures(maps, self.context.tensor(crops.array("mask", [index])[0]))
+
+        return {
+            "crop": read_crop,
+            "A_crop_img": lambda: crops.array("A_crop_img", [index])[0],
+            "depth_mm": lambda: templates.array("depth_mm", [index])[0],
+            "T_cam_obj": lambda: templates.array("T_cam_obj", [index])[0],
+        }
+
+    def _read_encoding(self, encodings: Entry, index: int) -> EncodedMap:
+        maps = self.context.tensor(encodings.array("maps", [index])[0])
+        return EncodedMap(maps[..., :-1].float().movedim(-1, 0), maps[..., -1] > 0)
 
     def _render_view(self, obj_id: int, T_cam_obj: Pose, A_crop_img: Matrix, K: Matrix) -> TemplateView:
         """Render the object in a pose as a crop of a query shows it: twice as large, then resampled like a template."""

@@ -89,7 +89,9 @@ def timing_key(step: str, stages: Stages, layers: Sequence[int] = (), rows: int 
         return digest([step, stages.extract.recipe(), deepest])
     if step == "fits":
         return digest([step, stages.extract.recipe(), [fit.recipe() for fit in stages.fits], stages.render.recipe()])
+    if step == "template encodings":
+        return digest([step, stages.fuse.recipe(), stages.encoding_shape])
     if step == "poses":
         online = [getattr(stages, name).recipe() for name in ONLINE_STAGES]
-        return digest([step, stages.extract.recipe(), online, rows, stages.second_look])
+        return digest([step, stages.extract.recipe(), online, rows, stages.second_look.recipe()])
     return digest([step, (stages.render if step == "templates" else stages.crop).recipe()])

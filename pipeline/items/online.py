@@ -64,6 +64,7 @@ class TemplateView:
 
     ``depth_mm``, ``K`` and ``T_cam_obj`` are those of the rendered view; ``A_crop_img`` maps its pixels to crop pixels.
     ``rgb``: the crop of a view that was rendered for one query (rerender); None for a stored template.
+    ``read_encoding``: reads its map as the first look compares it, where that is stored.
     """
 
     crop: CropFeatures
@@ -72,7 +73,25 @@ class TemplateView:
     K: Float[np.ndarray, "3 3"]
     T_cam_obj: Float[np.ndarray, "4 4"]
     rgb: UInt8[np.ndarray, "S S 3"] | None = None
+    read_encoding: Callable[[], Any] | None = None
     memo: Memo = field(default_factory=Memo, init=False, repr=False)
+
+
+class LazyView(TemplateView):
+    """A template whose arrays are read when they are first asked for; most hypotheses need few of them.
+
+    ``read``: from the name of a field to the function that reads it.
+    """
+
+    def __init__(self, K: Float[np.ndarray, "3 3"], read: Mapping[str, Callable[[], Any]]) -> None:
+        vars(self).update(K=K, rgb=None, read_encoding=read.get("encoding"), memo=Memo(), _read=read)
+
+    def __getattr__(self, name: str) -> Any:
+        read = vars(self).get("_read", {})
+        if name not in read:
+            raise AttributeError(name)
+        value = vars(self)[name] = read[name]()
+        return value
 
 
 class TemplateBank(Protocol):
@@ -90,6 +109,16 @@ class TemplateBank(Protocol):
     @property
     def norms(self) -> Float[Tensor, " n"]:
         """L2 norms of the flattened maps of ``features``, float32."""
+        ...
+
+    @property
+    def cell_norms(self) -> Float[Tensor, "n h w"]:
+        """Lengths of the cells of ``features``, float32."""
+        ...
+
+    @property
+    def cell_mask(self) -> Bool[Tensor, "n h w"]:
+        """Foreground cells of ``features``."""
         ...
 
     @property

@@ -8,6 +8,7 @@ from pipeline.functional.similarity import (
     global_cosine,
     l2_normalize,
     mutual_nearest,
+    nearest_rows,
     nearest_with_same_label,
 )
 
@@ -95,3 +96,13 @@ def test_empty_inputs_give_empty_results():
         len(best_per_group(torch.zeros(0), torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool), count=3))
         == 0
     )
+
+
+def test_nearest_rows_and_whether_they_are_mutual_equal_a_search_in_both_directions():
+    a, b = _random(40, 6), _random(30, 6, seed=1)
+    found, nearest, mutual = nearest_rows(a, b)
+    products = a @ b.T
+    assert torch.equal(nearest, products.argmax(1))
+    assert torch.equal(found, products.max(1).values)
+    assert torch.equal(mutual, products.argmax(0)[nearest] == torch.arange(40))
+    assert 0 < mutual.sum() < 30

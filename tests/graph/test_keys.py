@@ -25,7 +25,7 @@ from pipeline.bop.images import image_digest
 from pipeline.bop.photo import PhotoConfig
 from pipeline.errors import BadInput
 from pipeline.io.digests import file_digest, track_files
-from pipeline.method import Stages
+from pipeline.method import SecondLook, Stages
 from pipeline.options import Evaluate, Select
 
 NAMES = sorted(f"{path.parent.name}/{path.stem}" for path in VARIANTS)
@@ -150,7 +150,7 @@ def test_every_setting_of_a_run_is_in_a_key(tiny: Path, record_property):
     run = bop(tiny)
     perturbations = Perturbations(run)
     perturbations.change("fallback", replace(run, stages=replace(BASE, fallback=True)))
-    perturbations.change("second_look", replace(run, stages=replace(BASE, second_look=1)))
+    perturbations.change("second_look", replace(run, stages=replace(BASE, second_look=SecondLook(hypotheses=1))))
     for name, settings in (("select", run.select), ("evaluate", run.evaluate), ("runtime", run.runtime)):
         for field, others in changed_specs(settings, frozenset({"device", "models"})):
             changed = first_valid([replace(run, **{name: other}) for other in others])
@@ -309,7 +309,9 @@ def stages_of(reader: str, root: Path) -> Stages:
     return {
         "masks": BASE,
         "oracle, full masks": replace(BASE, **oracle, detect=variant("detect/gt_mask", visible=False)),
-        "true correspondences": replace(BASE, **oracle, correspond=variant("correspond/oracle"), second_look=1),
+        "true correspondences": replace(
+            BASE, **oracle, correspond=variant("correspond/oracle"), second_look=SecondLook(hypotheses=1)
+        ),
         "boxes": replace(BASE, detect=variant("detect/gt_bbox", bbox="obj"), crop=variant("crop/square", size=64)),
         "visible boxes": replace(BASE, detect=variant("detect/gt_bbox")),
         "detections": replace(BASE, detect=variant("detect/json", path=str(root / "detections.json"))),

@@ -29,7 +29,10 @@ from pipeline.synthetic.objects import make_object
 
 REFINERS = pytest.mark.parametrize("refine", [NoRefinement(), Featuremetric()], ids=["none", "featuremetric"])
 CROP, STUDIO = Square(), Raycast(count=80, size=512)
-EXACT = Featuremetric(loss="barron", scale=0.25, max_points=5000)  # the least pull of cells that the query hides
+BLURS = (2.0, 1.0, 0.0)
+EXACT = Featuremetric(
+    loss="barron", scale=0.25, sigmas_cells=(2.0, 1.0, 0.0), max_points=5000
+)  # the least pull of cells that the query hides
 K_QUERY = camera.resize_affine(2.0) @ np.array([[572.4, 0.0, 325.3], [0.0, 573.6, 242.0], [0.0, 0.0, 1.0]])
 
 
@@ -177,7 +180,7 @@ def test_the_cost_of_the_last_level_never_rises(loss, sigmas_cells, monkeypatch)
 def test_cells_beyond_max_points_are_drawn_by_the_seed():
     scene = case(3)
     start = off(scene.T_cam_obj, np.random.default_rng(0), 5, 5)
-    poses = [scene(Featuremetric(max_points=300, seed=seed), start) for seed in (0, 1, 0)]
+    poses = [scene(Featuremetric(sigmas_cells=BLURS, max_points=300, seed=seed), start) for seed in (0, 1, 0)]
     assert np.array_equal(poses[0], poses[2])
     assert not np.array_equal(poses[0], poses[1])
     assert errors(poses[0], scene.T_cam_obj)[0] < 1

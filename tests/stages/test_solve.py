@@ -144,10 +144,10 @@ def test_no_pose_puts_points_behind_the_camera(solve):
     assert (transform(solution.T_cam_obj, _points()[solution.inliers])[:, 2] > 0).all()
 
 
-def test_missing_poselib_names_the_extra(monkeypatch):
+def test_missing_poselib_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "poselib", None)
     with pytest.raises(
-        BadInput, match=r"found poselib, which is not installed, needs pip install --editable '\.\[poselib\]'"
+        BadInput, match=r"solve=poselib: found poselib, which is not installed, needs pip install poselib"
     ):
         Poselib()
 

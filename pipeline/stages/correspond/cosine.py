@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from pipeline.errors import NoPose
-from pipeline.functional.similarity import best_per_group, l2_normalize, nearest_with_same_label
+from pipeline.functional.similarity import best_per_group, l2_normalize, nearest_rows, nearest_with_same_label
 from pipeline.functional.subpixel import neighbourhood_shift
 from pipeline.items.features import Clusters, FusedPair
 from pipeline.items.matches import Correspondences, TrueMatches
@@ -47,11 +49,7 @@ class Cosine(Corresponder):
         query = l2_normalize(pair.query.float().movedim(0, -1).flatten(0, 1)[query_cell])
         template = l2_normalize(pair.template.float().movedim(0, -1)).contiguous()
         inside = template.flatten(0, 1).index_select(0, template_cell)
-        similarity, nearest = nearest_with_same_label(query, query_pair, inside, template_pair)
-        candidate = similarity > 0
-        if self.mutual:
-            _, back = nearest_with_same_label(inside, template_pair, query, query_pair)
-            candidate &= back[nearest] == torch.arange(len(query), device=query.device)
+        similarity, nearest, candidate = self._nearest(query, query_pair, inside, template_pair, len(clusters.pairs))
         limit = self.per_cluster if len(clusters.pairs) > 1 else len(query)
         kept = best_per_group(similarity, query_pair, candidate, count=limit)
         if len(kept) == 0:
@@ -67,3 +65,22 @@ class Cosine(Corresponder):
             similarity[kept],
             query_pair[kept],
         )
+
+    def _nearest(
+        self,
+        query: Float[Tensor, "m c"],
+        query_pair: Int[Tensor, " m"],
+        template: Float[Tensor, "n c"],
+        template_pair: Int[Tensor, " n"],
+        pairs: int,
+    ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"], Bool[Tensor, " m"]]:
+        """For each query cell: cosine with, and index of, its most similar template cell, and whether it may match."""
+        if self.mutual and pairs == 1:
+            similarity, nearest, mutual = nearest_rows(query, template)
+            return similarity, nearest, mutual & (similarity > 0)
+        similarity, nearest = nearest_with_same_label(query, query_pair, template, template_pair)
+        candidate = similarity > 0
+        if self.mutual:
+            _, back = nearest_with_same_label(template, template_pair, query, query_pair)
+            candidate &= back[nearest] == torch.arange(len(query), device=query.device)
+        return similarity, nearest, candidate

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Generic, TypeVar
+from math import gcd
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,9 +15,11 @@ from torch import Tensor
 
 from pipeline.backbones.extractor import Extractor
 from pipeline.errors import NoPose
+from pipeline.functional.maps import block_means
 from pipeline.functional.masks import cell_mask, foreground
 from pipeline.items.features import CropFeatures, FittedArrays, FusedPair
 from pipeline.items.fit import Fit
+from pipeline.items.online import Query, TemplateView
 from pipeline.spec import NonNegative, Spec
 
 Layers = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
@@ -50,6 +53,10 @@ class Fuser(Spec, ABC, Generic[Encoded]):
     def check(self, extract: Extractor) -> None:
         """Raise BadInput if the variant was trained on features that this extractor does not give."""
         return
+
+    def encoded_shape(self, shapes: Mapping[int, tuple[int, int, int]]) -> tuple[int, int, int] | None:
+        """(d, h, w) of the map that ``encode`` makes of layers of these shapes; None: unknown, so it is not stored."""
+        return None
 
     @abstractmethod
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> Encoded:
@@ -108,6 +115,40 @@ def pair_encoded(query: EncodedMap, template: EncodedMap) -> FusedPair:
     """Two maps that were encoded independently. Raises NoPose for a mask without a cell."""
     _require_cells(query.mask, template.mask)
     return FusedPair(query.features, template.features, query.mask, template.mask, query.note)
+
+
+def encode_view(
+    view: Query | TemplateView, fuse: Fuser[Any], fitted: Callable[[Fit], FittedArrays], *, block: int
+) -> Any:
+    """One image's map, encoded once or, for a template's coarse map, read; coarser maps are made from it."""
+    if block > 1:
+        stored = view.read_encoding if isinstance(view, TemplateView) else None
+        make = stored or (lambda: coarsen(encode_view(view, fuse, fitted, block=1), block=block))
+        return view.memo.get((fuse, block), make)
+    return view.memo.get(fuse, lambda: fuse.encode(view.crop, {} if fuse.fit is None else fitted(fuse.fit)))
+
+
+def coarse_shape(shape: tuple[int, int, int], *, block: int) -> tuple[int, int, int]:
+    """(d, h, w) of a map of this shape after ``coarsen``."""
+    d, h, w = shape
+    block = gcd(block, w)
+    return d, h // block, w // block
+
+
+def coarsen(encoded: EncodedMap, *, block: int) -> EncodedMap:
+    """The map of the mean features of blocks of cells; the largest divisor of its side that divides ``block``."""
+    block = gcd(block, encoded.features.shape[-1])
+    if block == 1:
+        return encoded
+    features, mask = block_means(encoded.features, encoded.mask, block=block)
+    return EncodedMap(features, mask, encoded.note)
+
+
+def coarsen_pair(pair: FusedPair, *, block: int) -> FusedPair:
+    """As ``coarsen``, for both maps of a pair."""
+    query = coarsen(EncodedMap(pair.query, pair.query_mask), block=block)
+    template = coarsen(EncodedMap(pair.template, pair.template_mask), block=block)
+    return FusedPair(query.features, template.features, query.mask, template.mask, pair.note)
 
 
 def _mask_cells(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from hashlib import sha256
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from pipeline.backbones.extractor import Extractor
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
-from pipeline.functional.gradients import EDGES, append_edges
+from pipeline.functional.gradients import EDGES, NEIGHBOURHOOD, append_edges
 from pipeline.functional.masks import cell_mask
 from pipeline.io.checkpoints import read_json
 from pipeline.io.digests import FileChanged, file_digest
@@ -73,6 +74,12 @@ class Learned(Fuser[EncodedMap]):
         _require_head()
         return file_digest(HEAD)
 
+    def encoded_shape(self, shapes: Mapping[int, tuple[int, int, int]]) -> tuple[int, int, int]:
+        """The head's channels, and 9 histograms where there are edges, at twice the resolution of the finest layer."""
+        cells = 2 * max(shapes[layer][1] for layer in LAYERS)
+        edges = NEIGHBOURHOOD * shapes[EDGES][0] if EDGES in self.layers else 0
+        return head_channels(self.weights_digest) + edges, cells, cells
+
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> EncodedMap:
         """The head's map, with the gradient histograms beside it."""
         maps = {layer: crop.maps[layer][None].float() for layer in self.layers}
@@ -85,6 +92,11 @@ class Learned(Fuser[EncodedMap]):
     def pair(self, query: EncodedMap, template: EncodedMap) -> FusedPair:
         """Fused maps. Raises NoPose for an empty mask."""
         return pair_encoded(query, template)
+
+
+def head_channels(weights_digest: str) -> int:
+    """Channels of the head's descriptors."""
+    return _head(torch.device("cpu"), weights_digest).narrow.out_channels
 
 
 @lru_cache(maxsize=2)

@@ -34,7 +34,7 @@ class MaskedCosine(Matcher):
         """The ``top_k`` best templates. Raises NoPose for an empty mask and for features without content."""
         features = query.crop.maps[self.layer]
         cells = features.shape[-1]
-        query_mask, bank_mask = cell_mask(query.crop.mask, cells=cells), cell_mask(bank.mask, cells=cells)
+        query_mask, bank_mask = cell_mask(query.crop.mask, cells=cells), bank.cell_mask
         if not query_mask.any():
             raise NoPose("match", "query mask is empty, needs 1 pixel")
         both = query_mask & bank_mask
@@ -43,5 +43,5 @@ class MaskedCosine(Matcher):
             "query": query_mask.expand_as(bank_mask),
             "union": query_mask | bank_mask,
         }[self.normalise]
-        similarity = cell_cosine(features, bank.features)
+        similarity = cell_cosine(features, bank.features, norm=bank.cell_norms)
         return rank(masked_mean(similarity, both, count=divisor.sum((1, 2)).float()), top_k=self.top_k)

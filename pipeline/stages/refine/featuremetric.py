@@ -47,10 +47,10 @@ class Featuremetric(Refiner):
 
     loss: Literal["barron", "cauchy", "geman_mcclure"] = "geman_mcclure"
     scale: PositiveFloat = 1.0
-    sigmas_cells: Annotated[tuple[NonNegativeFloat, ...], Field(min_length=1)] = (2.0, 1.0, 0.0)
+    sigmas_cells: Annotated[tuple[NonNegativeFloat, ...], Field(min_length=1)] = (1.0, 0.0)
     iterations: Positive = 30
     normalise: bool = True
-    max_points: Positive = 1000
+    max_points: Positive = 500
     seed: NonNegative = 0
 
     def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], geometry: PairGeometry) -> Float[np.ndarray, "4 4"]:

@@ -18,7 +18,7 @@ from pipeline.stages.solve import RansacSolver
 class Poselib(RansacSolver):
     """P3P in locally optimised RANSAC (Larsson, PoseLib).
 
-    An optional extra. PoseLib's own local optimisation runs inside its RANSAC whatever ``refine`` says.
+    PoseLib's own local optimisation runs inside its RANSAC whatever ``refine`` says.
     """
 
     kind: ClassVar[str] = "solve.poselib"
@@ -28,9 +28,7 @@ class Poselib(RansacSolver):
 
     def __post_init__(self) -> None:
         if find_spec("poselib") is None:
-            raise BadInput(
-                "solve=poselib", found="poselib, which is not installed", needed="pip install --editable '.[poselib]'"
-            )
+            raise BadInput("solve=poselib", found="poselib, which is not installed", needed="pip install poselib")
 
     def ransac(
         self, points_obj: Float[np.ndarray, "m 3"], px_img: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"]

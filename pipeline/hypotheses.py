@@ -1,0 +1,54 @@
+"""Which hypotheses are worth solving and rendering (method.SecondLook), and the pose that a template alone gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.functional import camera, rigid
+from pipeline.functional.crop_pose import transfer_template_pose
+from pipeline.functional.pnp import reprojection_error_px
+from pipeline.items.online import Hypothesis, Query, TemplateView
+
+
+def select_matched(hypotheses: Sequence[Hypothesis], *, count: int) -> list[Hypothesis]:
+    """The ``count`` hypotheses with most correspondences, in their order; all of them for 0."""
+    if not count or len(hypotheses) <= count:
+        return list(hypotheses)
+    matches = [0 if h.matches is None else len(h.matches.similarity) for h in hypotheses]
+    best = sorted(range(len(matches)), key=lambda i: -matches[i])[:count]
+    return [hypotheses[i] for i in sorted(best)]
+
+
+def select_distinct(
+    hypotheses: Sequence[Hypothesis], K_crop: Float[np.ndarray, "3 3"], *, count: int, apart_px: float
+) -> list[Hypothesis]:
+    """The first ``count`` hypotheses that show the object more than ``apart_px`` crop pixels from all better ones."""
+    chosen: list[Hypothesis] = []
+    for h in hypotheses:
+        if len(chosen) < count and not any(_distance_px(h, better, K_crop) <= apart_px for better in chosen):
+            chosen.append(h)
+    return chosen
+
+
+def is_convincing(hypothesis: Hypothesis, *, share: float) -> bool:
+    """Whether a rerendered hypothesis has at least this share of its matches as inliers."""
+    if hypothesis.rerendered is None or hypothesis.matches is None:
+        return False
+    return hypothesis.inliers >= share * len(hypothesis.matches.similarity)
+
+
+def _distance_px(hypothesis: Hypothesis, better: Hypothesis, K_crop: Float[np.ndarray, "3 3"]) -> float:
+    """Mean distance, crop pixels, of the better one's inliers under both poses; infinite where one has no pose."""
+    if hypothesis.solution is None or better.solution is None or better.points_obj is None:
+        return np.inf
+    points = better.points_obj[better.solution.inliers]
+    px = camera.project(K_crop, rigid.transform(better.solution.T_cam_obj, points))
+    return float(reprojection_error_px(points, px, K_crop, hypothesis.solution.T_cam_obj).mean())
+
+
+def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:
+    """T_cam_obj (mm) from a template alone: its rotation, with the place and scale of the query's crop."""
+    return transfer_template_pose(query.A_crop_img, query.K, template.A_crop_img, template.K, template.T_cam_obj)
