@@ -61,13 +61,18 @@ def test_a_variation_names_itself_and_changes_only_its_stages(name):
     expected = {
         "none": set(),
         "no_coprojection": {"fuse", "correspond"},
-        "no_clusters": {"cluster", "correspond"},
+        "no_clusters": {"correspond"},  # the default method has none
         "no_subpixel": {"correspond"},
         "oracle_mask": set(),
         "oracle_template": {"match"},
         "oracle_correspondences": {"match", "correspond", "refine", "second_look"},
     }[name]
     assert {key for key in plain if plain[key] != config[key]} - {"variation"} == expected
+
+
+def test_the_papers_stages_lose_their_clusters_in_a_variation():
+    assert composed("method=dzop")["cluster"]["_target_"].endswith("KMeans")
+    assert composed("method=dzop", "variation=no_clusters")["cluster"]["_target_"].endswith("One")
 
 
 def test_the_command_line_overrides_a_variation():
