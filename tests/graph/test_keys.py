@@ -85,7 +85,7 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
         sam = replace(variant("detect/cnos", describe=dino).proposals, weights=str(weights / "sam"), points_per_side=2)
         given[name] = {"describe": dino, "proposals": sam}
     others = {
-        "fuse/learned": {"extract": variant("extract/embedded", input_size=32)},
+        "fuse/learned": {"extract": variant("extract/embedded", input_size=128)},
         "correspond/salient": {"extract": dino},
     }
     stage = name.partition("/")[0]
