@@ -30,6 +30,7 @@ METHODS = {
     "foundpose": (
         *("method=foundpose", "extract=hog", "extract.context_cells=0", "match.layer=8", "fuse.layers=[8]"),
         *("fuse.dim=6", "render.inplane=1", "match.count=30", "match.dim=4"),
+        *("crop.erode_template=0", "crop.open_query=0"),  # as the archive was written
     ),
 }
 

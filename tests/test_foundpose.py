@@ -14,6 +14,7 @@ from tiny_bop import edit_json, write_tiny_bop
 from pipeline.bop.dataset import open_dataset
 from pipeline.configuration import build_stages
 from pipeline.fits import chain
+from pipeline.functional.masks import erode
 from pipeline.functional.viewpoints import viewpoint_rotations
 from pipeline.graph import Context, Graph
 from pipeline.spec import Runtime
@@ -60,6 +61,7 @@ def test_the_methods_numbers_are_foundposes_whatever_the_dataset_says():
         "solve.epnp",
     ]
     assert (chosen.solve.plane, chosen.solve.threshold_px, chosen.solve.iterations) == ("crop", 10.0, 400)
+    assert (chosen.crop.erode_template, chosen.crop.open_query) == (2, 1)  # 5 x 5 and 3 x 3
     assert (chosen.match.count, chosen.match.top_k, chosen.correspond.count) == (2048, 5, 300)
     assert chosen.fits == chain(chosen.match.fit)  # words and projection share one PCA
 
@@ -128,3 +130,27 @@ def test_poses_of_foundposes_stages_are_written(dzop, tmp_path):
     solved = [record for record in records if record["status"] == "estimate"]
     assert len(records) == 4
     assert all(np.isfinite(record["T_cam_obj"]).all() for record in solved)
+
+
+def test_templates_are_eroded_and_photographs_opened(tmp_path):
+    dataset = open_dataset(write_tiny_bop(tmp_path / "tiny"), name="tiny")
+    small = [o for o in SMALL if o.partition(".")[0] in ("render", "crop")]
+
+    def masks(erode: int, open_: int) -> list[np.ndarray]:
+        chosen = stages("render=raycast", *small, f"crop.erode_template={erode}", f"crop.open_query={open_}")
+        graph = Graph(Context(chosen, dataset, dataset.targets, Store(MemoryStoreConfig()), Runtime(progress=False)))
+        graph.templates.make_crops(1, graph.templates.make_templates(1))
+        image = graph.context.image_ids[0]
+        graph.queries.make_crops(image)
+        return [
+            graph.context.store.read(ref).array("mask")
+            for ref in (graph.templates.crops(1), graph.queries.crops(image))
+        ]
+
+    plain, eroded, opened = masks(0, 0), masks(2, 0), masks(0, 1)
+    assert all(
+        np.array_equal(erode(before, radius=2), after) for before, after in zip(plain[0], eroded[0], strict=True)
+    )
+    assert 0 < eroded[0].sum() < plain[0].sum()
+    assert np.array_equal(plain[1], eroded[1])
+    assert np.array_equal(plain[0], opened[0])

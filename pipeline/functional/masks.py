@@ -1,9 +1,11 @@
-"""Crop masks at the resolution of feature maps."""
+"""Masks: morphology, and crop masks at the resolution of feature maps."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from torch import Tensor
 
 _ROUNDING = 1e-5  # a cell covered by exactly half counts as half in float32 too
@@ -35,3 +37,17 @@ def cell_mask(mask: Bool[Tensor, "*n S S"], *, cells: int) -> Bool[Tensor, "*n c
 def foreground(mask: Bool[Tensor, "*cells"]) -> Int[Tensor, " m"]:
     """Flat indices of the True cells of a mask, in row-major order."""
     return mask.flatten().nonzero()[:, 0]
+
+
+def erode(mask: Bool[np.ndarray, "H W"], *, radius: int) -> Bool[np.ndarray, "H W"]:
+    """Erosion by a square of 2 ``radius`` + 1 pixels a side; what lies outside the image erodes nothing."""
+    return ndimage.binary_erosion(mask, _square(radius), border_value=1)
+
+
+def open_mask(mask: Bool[np.ndarray, "H W"], *, radius: int) -> Bool[np.ndarray, "H W"]:
+    """Opening (erosion, then dilation) by a square of 2 ``radius`` + 1 pixels a side: drops what no square fits in."""
+    return ndimage.binary_dilation(erode(mask, radius=radius), _square(radius))
+
+
+def _square(radius: int) -> Bool[np.ndarray, "k k"]:
+    return np.ones((2 * radius + 1,) * 2, bool)

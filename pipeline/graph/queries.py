@@ -131,11 +131,11 @@ class QueryNodes:
         """Crops, and a document that says which detections they are and why others failed."""
         usable = self.of_image[image]
         photo = self.context.dataset.image(*image)
-        crops, kept, failed = [], [], {}
+        crop, crops, kept, failed = self.context.stages.crop, list[Crop](), list[int](), dict[str, str]()
         for position, (_, detection) in enumerate(usable):
             try:
-                mask = None if detection.rle is None else decode_rle(detection.rle)
-                crops.append(self.context.stages.crop(photo.rgb, mask, detection.bbox_xyxy, photo.K))
+                mask = None if detection.rle is None else crop.clean_query(decode_rle(detection.rle))
+                crops.append(crop(photo.rgb, mask, detection.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose as failure:
                 failed[str(position)] = failure.reason

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
 from typing import Any
 
@@ -172,7 +172,7 @@ class TemplateNodes:
             whole = (-0.5, -0.5, w - 0.5, h - 0.5)
             crop = self.context.stages.crop
             crops = [crop(rgb, mask, whole, views.K) for rgb, mask in zip(views.rgb, views.mask, strict=True)]
-            return {ref.key: stack_crops(crops)}
+            return {ref.key: stack_crops([replace(c, mask=crop.clean_template(c.mask)) for c in crops])}
 
         self.context.fill(
             "template crops", f"crop object {obj_id}", {ref: self.context.crops_layout()}, count, CROPS_PER_BATCH,
@@ -392,7 +392,7 @@ class TemplateNodes:
         rgb, depth_mm = stages.render.render(self.context.model(obj_id).mesh, K_drawn, T_drawn_obj[None], size_hw)
         A_crop_drawn = np.linalg.inv(A_drawn_crop)
         crop = np.rint(resample(rgb[0], A_crop_drawn, size=size)).clip(0, 255).astype(np.uint8)
-        mask = resample(depth_mm[0] > 0, A_crop_drawn, size=size) >= HALF
+        mask = stages.crop.clean_template(resample(depth_mm[0] > 0, A_crop_drawn, size=size) >= HALF)
         geometry = Geometry([depth_mm[0]], K_drawn[None], T_drawn_obj[None])
         crops = Crops(crop[None], mask[None], A_crop_drawn[None], geometry)
         features = {

@@ -1,6 +1,9 @@
+import cv2
+import numpy as np
+import pytest
 import torch
 
-from pipeline.functional.masks import cell_coverage, cell_mask, foreground
+from pipeline.functional.masks import cell_coverage, cell_mask, erode, foreground, open_mask
 
 
 def test_coverage_keeps_the_area_for_any_ratio_of_pixels_to_cells():
@@ -35,3 +38,20 @@ def test_mask_of_one_pixel_keeps_its_best_covered_cell():
 
 def test_foreground_lists_cells_in_reading_order():
     assert foreground(torch.tensor([[False, True], [True, False]])).tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("radius", [0, 1, 2])
+def test_erosion_and_opening_are_opencvs(radius):
+    rng, square = np.random.default_rng(radius), np.ones((2 * radius + 1,) * 2, np.uint8)
+    for density in (0.5, 0.9, 0.99):
+        mask = rng.random((31, 44)) < density
+        assert np.array_equal(erode(mask, radius=radius), cv2.erode(mask.astype(np.uint8), square) > 0)
+        opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+        assert np.array_equal(open_mask(mask, radius=radius), opened)
+
+
+def test_a_mask_that_reaches_the_images_border_is_not_eroded_there():
+    mask = np.zeros((9, 9), bool)
+    mask[:4] = True
+    assert erode(mask, radius=1).sum() == 3 * 9
+    assert np.array_equal(open_mask(mask, radius=1), mask)

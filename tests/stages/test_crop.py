@@ -3,7 +3,7 @@ import pytest
 
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.camera import apply_homography, crop_camera, local_zoom, project
-from pipeline.spec import build
+from pipeline.spec import build, digest
 from pipeline.stages.crop.square import Square
 from pipeline.stages.crop.virtual import Virtual
 
@@ -137,3 +137,34 @@ def test_an_object_that_cannot_be_cropped_says_why(variant, mask, bbox, reason):
 def test_padding_below_one_is_refused():
     with pytest.raises(BadInput, match=r"crop.padding_ratio: found 0.9, needs greater than or equal to 1"):
         build(Square, {"padding_ratio": 0.9}, where="crop")
+
+
+def test_masks_are_cleaned_only_where_asked():
+    _, mask = _scene()
+    for crop in (Square(), Virtual()):
+        assert crop.clean_query(mask) is mask
+        assert np.array_equal(crop.clean_template(mask[:, :90]), mask[:, :90])
+
+
+def test_opening_drops_specks_of_a_detection():
+    _, mask = _scene()
+    specks = mask.copy()
+    specks[3, 3] = specks[5:7, 100:102] = specks[40, 60:110] = True  # a pixel, 2 x 2 and a line
+    assert np.array_equal(Virtual(open_query=1).clean_query(specks), mask)
+    assert not Virtual(open_query=1).clean_query(np.zeros_like(mask)).any()  # an empty mask keeps its own reason
+    thin = np.zeros_like(mask)
+    thin[40:44, 20:45] = True
+    with pytest.raises(NoPose, match=r"mask of 100 px is too thin, crop\.open_query needs 5 x 5 px"):
+        Virtual(open_query=2).clean_query(thin)
+
+
+def test_erosion_takes_a_templates_contour_and_never_all_of_it():
+    mask = _scene()[1][:, :90]
+    assert Virtual(erode_template=2).clean_template(mask).sum() == mask.sum() - 2 * (40 + 50) * 2 + 4 * 4
+    assert Virtual(erode_template=10).clean_template(mask) is mask  # bars of 20 px
+
+
+def test_switches_that_are_off_keep_their_key():
+    assert Virtual().recipe() == Virtual(erode_template=0, open_query=0).recipe()
+    assert not {"erode_template", "open_query"} & set(Virtual().recipe())
+    assert len({digest(Virtual(**field).recipe()) for field in ({}, {"erode_template": 1}, {"open_query": 1})}) == 3

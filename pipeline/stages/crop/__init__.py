@@ -21,6 +21,9 @@ BBox = tuple[float, float, float, float]
 class Cropper(Spec, ABC):
     """Contract of a crop variant; templates and queries are cropped in the same way.
 
+    A variant may clean masks on one side: ``clean_query`` before a detection is cropped, ``clean_template`` after a
+    template is.
+
     ``size``: side S of the crop in pixels. ``needs_camera``: whether the crop depends on K, which then enters its key.
     """
 
@@ -36,6 +39,14 @@ class Cropper(Spec, ABC):
         K: Float[np.ndarray, "3 3"],
     ) -> Crop:
         """The crop around the mask, or around the box where ``mask`` is None. Raises NoPose for an empty mask."""
+
+    def clean_query(self, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+        """A detection's mask, in image pixels, as it is to be cropped. Raises NoPose where nothing is left of it."""
+        return mask
+
+    def clean_template(self, mask: Bool[np.ndarray, "S S"]) -> Bool[np.ndarray, "S S"]:
+        """A template's mask, in crop pixels, as later stages are to use it."""
+        return mask
 
 
 def locate_object(
