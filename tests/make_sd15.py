@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -63,13 +65,21 @@ def text_width(*, small: bool, version: int) -> int:
     return 32 if small else {1: 768, 2: 1024}[version]
 
 
-def write_folder(root: Path, *, small: bool = True, version: int = 1, dtype: str = "float32", seed: int = 0) -> Path:
-    """The folder, with full-precision file names for any dtype."""
+def write_folder(
+    root: Path,
+    *,
+    small: bool = True,
+    version: int = 1,
+    dtype: str = "float32",
+    seed: int = 0,
+    unet: Mapping[str, Any] = MappingProxyType({}),
+) -> Path:
+    """The folder, with full-precision file names for any dtype. ``unet``: fields of its config that differ."""
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 
     torch_dtype = getattr(torch, dtype)
     for part, cls, config in (
-        ("unet", UNet2DConditionModel, unet_config(small=small, version=version)),
+        ("unet", UNet2DConditionModel, unet_config(small=small, version=version) | dict(unet)),
         ("vae", AutoencoderKL, vae_config(small=small)),
     ):
         randomise_weights(allocate_model(cls, config, torch_dtype), seed=seed).save_pretrained(root / part)

@@ -30,6 +30,7 @@ PINS = Path(__file__).with_name("pins.json")
 # need files, are others in disguise, or change with the weights that ship
 UNPINNED = {
     "extract/stable_diffusion",
+    "extract/bk_sdm",
     "detect/json",
     "detect/photo",
     "render/auto",

@@ -70,6 +70,7 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
         "extract/dino": {"weights": str(weights / "vit"), "input_size": 64, "binned": (9,)},
         "extract/dinov2": {"weights": str(weights / "dinov2"), "input_size": 56},
         "extract/stable_diffusion": {"weights": str(weights / "sd"), "input_size": 64},
+        "extract/bk_sdm": {"weights": str(weights / "sd"), "input_size": 64},
         "extract/fusion": {"first": variant("extract/hog"), "second": dino, "layers": ((2, 5), (8, 5), (5, 5))},
         "extract/embedded": {"input_size": 32},
         "extract/random_sd": {"input_size": 32},

@@ -41,12 +41,14 @@ def map_shape(unet: Mapping[str, Any], *, layer: int, hook: Hook, latent_size: i
 def find_tapped_module(unet: Any, *, layer: int, hook: Hook) -> nn.Module:
     """The module whose output is the map of block ``layer``.
 
-    ``pre``: the block's input before the skip connection is concatenated, i.e. the output of block ``layer`` - 1 or of
-    the mid block. ``post``: the block's output, including attention and, for the last resnet of an up block, the
-    upsampler. ``resnet``: the residual branch, before the shortcut is added.
+    ``pre``: the block's input before the skip connection is concatenated, i.e. the output of block ``layer`` - 1, of
+    the mid block, or of the encoder where there is no mid block. ``post``: the block's output, including attention and,
+    for the last resnet of an up block, the upsampler. ``resnet``: the residual branch, before the shortcut is added.
     """
     if hook == "pre":
-        return unet.mid_block if layer == 0 else find_tapped_module(unet, layer=layer - 1, hook="post")
+        if layer > 0:
+            return find_tapped_module(unet, layer=layer - 1, hook="post")
+        return unet.mid_block if unet.mid_block is not None else unet.down_blocks[-1]
     up_block, resnet = _locate(unet, layer)
     if hook == "resnet":
         return up_block.resnets[resnet].conv2
