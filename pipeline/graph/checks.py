@@ -47,13 +47,16 @@ def check_layers(stages: Stages) -> None:
 
 
 def settings_warnings(stages: Stages) -> list[str]:
-    """One line per setting that cannot do what it says, because another one leaves it nothing to choose from."""
+    """One line per setting that cannot do what it says, because another one leaves it nothing to choose from.
+
+    ``per_cluster`` at its default is not named: methods with one cluster leave it there.
+    """
     warnings = []
     top_k, views = getattr(stages.match, "top_k", 0), stages.render.count_views()
     if views is not None and top_k > views:
         warnings.append(f"match.top_k {top_k} is more than the {views} templates of an object: all of them are kept")
-    if stages.cluster.kind == "cluster.one" and hasattr(stages.correspond, "per_cluster"):
-        per_cluster = stages.correspond.per_cluster
+    per_cluster = getattr(stages.correspond, "per_cluster", None)
+    if stages.cluster.kind == "cluster.one" and per_cluster != getattr(type(stages.correspond), "per_cluster", None):
         warnings.append(f"correspond.per_cluster {per_cluster} has no effect with cluster=one: all matches are kept")
     return warnings
 

@@ -25,6 +25,7 @@ from pipeline.stages.render.raycast import Raycast
         ({"match": Cosine(top_k=24)}, ""),
         ({"render": Raycast(count=3, inplane=2), "match": Cosine(top_k=7)}, "more than the 6 templates of an object"),
         ({"correspond": Corresponder(per_cluster=5)}, "correspond.per_cluster 5 has no effect with cluster=one"),
+        ({"correspond": Corresponder()}, ""),
         ({"correspond": Salient()}, ""),
         ({"correspond": Corresponder(per_cluster=5), "cluster": KMeans()}, ""),
     ],
