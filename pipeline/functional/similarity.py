@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,6 +28,23 @@ def global_cosine(
     q = l2_normalize(query.float().flatten())
     dot = torch.cat([block.flatten(1) @ q for block in _float_blocks(bank)])
     return _divide_or_zero(dot, map_norms(bank) if norm is None else norm)
+
+
+def joint_cosine(
+    query: Sequence[Float[Tensor, "_c _h _w"]],
+    bank: Sequence[Float[Tensor, "n _c _h _w"]],
+    *,
+    norms: Sequence[Float[Tensor, " n"]],
+) -> Float[Tensor, " n"]:
+    """Cosine of several maps as one vector: all values of the query's maps with those of each row of the bank's.
+
+    ``norms``: ``map_norms`` of each map of the bank.
+    """
+    parts = [
+        global_cosine(q, b, norm=norm) * norm * q.float().norm() for q, b, norm in zip(query, bank, norms, strict=True)
+    ]
+    query_norm = torch.stack([q.float().norm() for q in query]).norm()
+    return _divide_or_zero(torch.stack(parts).sum(0), torch.stack(list(norms)).norm(dim=0) * query_norm)
 
 
 def map_norms(bank: Float[Tensor, "n c h w"]) -> Float[Tensor, " n"]:

@@ -15,7 +15,7 @@ from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import diagnose_camera
 from pipeline.graph.context import Context, ImageId
-from pipeline.items.features import PSEUDO_LAYERS, SALIENCY_LAYER
+from pipeline.items.features import CLASS_FACET_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.objects import MeshFacts
 from pipeline.items.views import Detection
 from pipeline.method import Stages
@@ -42,6 +42,9 @@ def check_layers(stages: Stages) -> None:
             if layer == SALIENCY_LAYER:
                 found = f"{stages.correspond.kind}, and {stages.extract.kind} has no saliency"
                 raise BadInput("correspond", found=found, needed="extract=dino or dinov2") from None
+            if layer == CLASS_FACET_LAYER:
+                found = f"true, and {stages.extract.kind} has no class token"
+                raise BadInput("match.class_token", found=found, needed="extract=dino, or false") from None
             needed = error.needed.replace(f", {PSEUDO_LAYERS}", "")  # these fields take no pseudo-layers
             raise BadInput(field_of_layer[layer], found=error.found, needed=needed) from None
 

@@ -21,8 +21,13 @@ SALIENCY_LAYER = -1
 CLASS_TOKEN_LAYER = -2
 """Pseudo-layer of vision transformers: the class token, (c 1 1)."""
 
-PSEUDO_LAYERS = f"{SALIENCY_LAYER} (saliency) or {CLASS_TOKEN_LAYER} (class token)"
-"""Both, as messages name them."""
+CLASS_FACET_LAYER = -3
+"""Pseudo-layer of vision transformers: key, query or value of the class token in the last block, (c 1 1)."""
+
+PSEUDO_LAYERS = (
+    f"{SALIENCY_LAYER} (saliency), {CLASS_TOKEN_LAYER} (class token) or {CLASS_FACET_LAYER} (its key, query or value)"
+)
+"""All of them, as messages name them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from pipeline.backbones.vit.transformer import pad_border, resize_positions
 from pipeline.errors import BadInput
 from pipeline.functional import camera
 from pipeline.functional.binning import log_bin
-from pipeline.items.features import CLASS_TOKEN_LAYER, SALIENCY_LAYER, FeatureMaps
+from pipeline.items.features import CLASS_FACET_LAYER, CLASS_TOKEN_LAYER, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Runtime, build
 from pipeline.stages.extract.dino import Dino
@@ -154,6 +154,18 @@ def test_the_class_token_is_the_first_of_the_last_hidden_state(folder: Path) -> 
     for fields in ({}, {"facet": "key"}, {"facet": "token", "norm_last": False}):
         ours = features(folder, crops, [CLASS_TOKEN_LAYER, 0], **fields)[CLASS_TOKEN_LAYER]
         assert_close(ours, plain.last[:, 0, :, None, None])
+
+
+@pytest.mark.parametrize("facet", ["key", "query", "value"])
+def test_the_class_tokens_facet_is_that_of_the_last_block(folder: Path, facet: str) -> None:
+    crops, plain = some_crops(), plain_forward(folder, some_crops())
+    spec = extractor(folder, facet=facet)
+    for layers in ([CLASS_FACET_LAYER], [0, CLASS_FACET_LAYER, CLASS_TOKEN_LAYER, SALIENCY_LAYER]):
+        ours = spec.load(CPU)(crops, layers)[CLASS_FACET_LAYER]
+        assert tuple(ours.shape[1:]) == spec.feature_shape(CLASS_FACET_LAYER)
+        assert_close(ours, getattr(plain, facet)[-1][:, 0, :, None, None])
+    with pytest.raises(BadInput, match=r"extract\.facet: found token, needs key, query or value, for layer -3"):
+        extractor(folder, facet="token").feature_shape(CLASS_FACET_LAYER)
 
 
 def test_overlapping_patches_equal_plain_ones_of_the_shifted_image(folders: dict[str, Path], tmp_path: Path) -> None:
@@ -331,8 +343,8 @@ def test_a_layer_stride_or_size_the_model_does_not_have_is_named(folders: dict[s
     dino, dinov2 = folders["vit"], folders["dinov2"]
     with pytest.raises(BadInput, match=r"extract layer: found 3, needs 0\.\.2, the transformer's 3 blocks, -1"):
         extractor(dino).feature_shape(3)
-    with pytest.raises(BadInput, match=r"extract layer: found -3, needs 0\.\.2"):
-        extractor(dino).load(CPU)(some_crops(1), [0, -3])
+    with pytest.raises(BadInput, match=r"extract layer: found -4, needs 0\.\.2"):
+        extractor(dino).load(CPU)(some_crops(1), [0, -4])
     assert refusal(dino, stride=3) == "extract.stride: found 3, needs a divisor of the patch size 8: 1, 2, 4, 8"
     assert refusal(dinov2, DinoV2, stride=28) == (
         "extract.stride: found 28, needs a divisor of the patch size 14: 1, 2, 7, 14"

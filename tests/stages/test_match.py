@@ -1,13 +1,15 @@
 import numpy as np
 import pytest
 import torch
+from array_bank import ArrayBank, match_truth
 from array_bank import match as match_maps
-from array_bank import match_truth
 from jaxtyping import TypeCheckError
 
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.masks import cell_mask
 from pipeline.functional.rigid import look_at, rigid, rotation_between
+from pipeline.items.features import CLASS_FACET_LAYER, CropFeatures
+from pipeline.items.online import Query
 from pipeline.stages.match import rank
 from pipeline.stages.match.cosine import Cosine
 from pipeline.stages.match.masked_cosine import MaskedCosine
@@ -148,3 +150,27 @@ def test_words_of_features_that_are_not_finite_or_tell_nothing_apart_say_why():
         match_maps(WORDS[0], torch.full((10, 8, 8), torch.nan), mask[0], bank, mask)
     with pytest.raises(NoPose, match="match: query and templates share no feature"):
         match_maps(WORDS[0], bank[0].float(), mask[0], bank[:1], mask[:1])  # every word is in the only template
+
+
+class BankWithToken(ArrayBank):
+    tokens: torch.Tensor
+
+    def maps(self, layer: int) -> torch.Tensor:
+        return self.tokens if layer == CLASS_FACET_LAYER else self.features
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0, 30.0])
+def test_the_class_token_is_one_more_cell(scale):
+    features, mask = _bank()
+    tokens = scale * torch.randn(len(mask), 10, 1, 1, generator=torch.Generator().manual_seed(1))
+    bank = BankWithToken(features, mask)
+    bank.tokens = tokens
+    maps = {2: features[3].float() + features[7].float(), CLASS_FACET_LAYER: tokens[4]}
+    spec = Cosine(top_k=12, class_token=True)
+    found = spec(Query(CropFeatures(maps, mask[3]), np.eye(3), np.eye(3)), bank)
+    joined = torch.cat([features.float().flatten(1), tokens.flatten(1)], 1)
+    query = torch.cat([maps[2].flatten(), maps[CLASS_FACET_LAYER].flatten()])
+    expected = torch.nn.functional.cosine_similarity(joined, query[None])
+    assert spec.layers == (2, CLASS_FACET_LAYER)
+    assert torch.allclose(found.score, expected[found.index], atol=1e-6)
+    assert found.score.tolist() == sorted(found.score.tolist(), reverse=True)

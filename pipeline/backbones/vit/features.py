@@ -32,7 +32,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.binning import bin_count, log_bin
 from pipeline.io.checkpoints import tensor_shapes
 from pipeline.io.digests import files_digest
-from pipeline.items.features import CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
+from pipeline.items.features import CLASS_FACET_LAYER, CLASS_TOKEN_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER, FeatureMaps
 from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, spec
 
@@ -49,7 +49,8 @@ class VitFeatures(Extractor):
     of the patch size; None: the patch size. ``binned``: layers whose cells have 1 + 8 ``hierarchy`` spatial bins
     (``functional.binning``). ``norm_last``: tokens of any block (not keys, queries or values) go through the model's
     last layer norm. ``saliency_heads``: heads of the last block whose attention gives SALIENCY_LAYER (1 h w), None for
-    all. CLASS_TOKEN_LAYER (c 1 1) is the class token after the last layer norm.
+    all. CLASS_TOKEN_LAYER (c 1 1) is the class token after the last layer norm, CLASS_FACET_LAYER (c 1 1) its key,
+    query or value in the last block.
     """
 
     model_types: ClassVar[tuple[str, ...]]
@@ -104,7 +105,7 @@ class VitFeatures(Extractor):
         """(c, h, w) of one crop's map. Raises BadInput for a layer, stride or input size the model does not have."""
         _check(self, (layer,))
         cells, width = self.input_size // self.stride_px, self.sizes.width
-        if layer == CLASS_TOKEN_LAYER:
+        if layer in (CLASS_TOKEN_LAYER, CLASS_FACET_LAYER):
             return width, 1, 1
         if layer == SALIENCY_LAYER:
             return 1, cells, cells
@@ -163,7 +164,7 @@ class VitBackbone:
         return standardise(padded).to(getattr(torch, s.dtype))
 
     def _to_map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
-        side = 1 if layer == CLASS_TOKEN_LAYER else self.spec.input_size // self.spec.stride_px
+        side = 1 if layer in (CLASS_TOKEN_LAYER, CLASS_FACET_LAYER) else self.spec.input_size // self.spec.stride_px
         maps = tokens.transpose(1, 2).unflatten(2, (side, side))
         return log_bin(maps, hierarchy=self.spec.hierarchy) if layer in self.spec.binned else maps
 
@@ -175,9 +176,12 @@ def _heads(spec: VitFeatures) -> Sequence[int]:
 def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
     a, last = spec.sizes, spec.sizes.depth - 1
     for layer in layers:
-        if not 0 <= layer <= last and layer not in (SALIENCY_LAYER, CLASS_TOKEN_LAYER):
+        if not 0 <= layer <= last and layer not in (SALIENCY_LAYER, CLASS_TOKEN_LAYER, CLASS_FACET_LAYER):
             needed = f"0..{last}, the transformer's {a.depth} blocks, {PSEUDO_LAYERS}"
             raise BadInput("extract layer", found=layer, needed=needed)
+    if CLASS_FACET_LAYER in layers and spec.facet == "token":
+        needed = f"key, query or value, for layer {CLASS_FACET_LAYER} (match.class_token)"
+        raise BadInput("extract.facet", found="token", needed=needed)
     if a.patch % spec.stride_px:
         divisors = ", ".join(str(n) for n in range(1, a.patch + 1) if a.patch % n == 0)
         raise BadInput("extract.stride", found=spec.stride, needed=f"a divisor of the patch size {a.patch}: {divisors}")

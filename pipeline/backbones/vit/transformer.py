@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, interpolate, pad
 
-from pipeline.items.features import CLASS_TOKEN_LAYER, SALIENCY_LAYER
+from pipeline.items.features import CLASS_FACET_LAYER, CLASS_TOKEN_LAYER, SALIENCY_LAYER
 
 Facet = Literal["key", "query", "value", "token"]
 
@@ -79,15 +79,18 @@ def read_block_tokens(
     """Tokens of the given blocks without the first ``skipped`` ones (class token, registers).
 
     Queries, keys and values are those of the block's attention, with all heads concatenated; "token" is the block's
-    output, after the model's last norm if ``norm_last``. Pseudo-layers: the class token (n 1 c), its attention (n t 1).
+    output, after the model's last norm if ``norm_last``. Pseudo-layers: the class token (n 1 c), its attention (n t 1),
+    and its query, key or value in the last block (n 1 c).
     """
     blocks = find_blocks(model)
     last = len(blocks) - 1
-    deepest = last if {SALIENCY_LAYER, CLASS_TOKEN_LAYER} & set(layers) else max(layers, default=-1)
+    deepest = last if min(layers, default=0) < 0 else max(layers, default=-1)
     found: dict[int, Tensor] = {}
     for layer, block in enumerate(blocks[: deepest + 1]):
         if layer in layers and facet != "token":
             found[layer] = project_facet(block, tokens, facet)[:, skipped:]
+        if layer == last and CLASS_FACET_LAYER in layers:
+            found[CLASS_FACET_LAYER] = project_facet(block, tokens[:, :1], facet)
         if layer == last and SALIENCY_LAYER in layers:
             found[SALIENCY_LAYER] = class_attention(block, tokens, heads=saliency_heads, model=model, skipped=skipped)
         if layer == deepest and CLASS_TOKEN_LAYER not in layers and not (layer in layers and facet == "token"):
