@@ -193,3 +193,36 @@ def test_salient_says_that_nothing_is():
     pair = replace(_salient_pair(), query_saliency=torch.zeros(H, H))
     with pytest.raises(NoPose, match="more salient than 0"):
         Salient()(pair, One()(pair), crop_size=H)
+
+
+def test_saliency_alone_is_the_foreground_where_asked():
+    pair = _salient_pair()
+    spec = Salient(count=1000, threshold=0.3, foreground="saliency")
+    found = spec(pair, One()(pair), crop_size=H)
+    no_mask = torch.zeros_like(pair.query_mask)
+    no_mask[0, 0] = True
+    masked = replace(pair, query_mask=no_mask, template_mask=no_mask)
+    again = spec(masked, One()(masked), crop_size=H)
+    assert torch.equal(found.query_px, again.query_px)
+    assert torch.equal(found.template_px, again.template_px)
+    similarity = torch.einsum(
+        "ca,cb->ab", *(torch.nn.functional.normalize(m.flatten(1), dim=0) for m in (pair.query, pair.template))
+    )
+    forth, back = similarity.argmax(1).tolist(), similarity.argmax(0).tolist()
+    salient = [(s.flatten() > 0.3).tolist() for s in (pair.query_saliency, pair.template_saliency)]
+    expected = {(i, j) for i, j in enumerate(forth) if back[j] == i and salient[0][i] and salient[1][j]}
+    flat = [
+        (px.double().round() @ torch.tensor([1.0, H]).double()).long().tolist()
+        for px in (found.query_px, found.template_px)
+    ]
+    assert set(zip(*flat, strict=True)) == expected
+    assert found.cluster.unique().tolist() == [0]
+    nothing = replace(pair, query_saliency=torch.zeros(H, H))
+    with pytest.raises(NoPose, match=f"no salient mutual neighbours among {H * H} and {H * H} cells"):
+        spec(nothing, One()(nothing), crop_size=H)
+
+
+def test_a_mask_as_foreground_keeps_the_key():
+    assert Salient().recipe() == Salient(foreground="mask").recipe()
+    assert Salient().recipe() != Salient(foreground="saliency").recipe()
+    assert "foreground" not in Salient().recipe()
