@@ -19,7 +19,7 @@ METHODS = {
     "dzop_x": (),
     "dzop_sd": ("extract.input_size=256",),
     "dzop_paper": ("extract=stable_diffusion", "extract.input_size=256"),
-    "zs6d": ("extract.input_size=112",),
+    "zs6d": ("extract.input_size=112", "crop.size=112"),
     "foundpose": ("extract.input_size=112", "crop.size=96", "render.inplane=1", "match.count=50"),
     "fusion": ("extract.first.input_size=256", "extract.second.input_size=112"),
 }
@@ -70,7 +70,7 @@ def test_templates_are_rendered_once_for_dzop_and_zs6d(dzop):
     first = dzop("method=dzop", "step=onboard").counts()[-1]
     second = dzop("method=zs6d", "step=onboard", *METHODS["zs6d"]).counts()[-1]
     assert first["templates"] == second["templates"][::-1] == (18, 0)
-    assert second["template crops"][0] == 0
+    assert second["template crops"] == (18, 0)  # a tight crop of its own
     assert second["template features"][0] > 0
 
 
@@ -80,6 +80,12 @@ def test_a_method_that_needs_saliency_says_who_has_it(dzop):
     assert (
         "correspond: found correspond.salient, and extract.hog has no saliency, needs extract=dino or dinov2" in ran.err
     )
+
+
+def test_a_method_that_compares_class_tokens_says_who_has_them(dzop):
+    ran = dzop("method=dzop", "match.class_token=true", "extract=hog")
+    assert ran.status == 1
+    assert "match.class_token: found true, and extract.hog has no class token, needs extract=dino, or false" in ran.err
 
 
 CNOS = ("detect=cnos", "detect.proposals.points_per_side=3", "detect.proposals.min_iou=0", "detect.min_score=0",
