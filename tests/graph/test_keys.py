@@ -29,7 +29,7 @@ from pipeline.method import SecondLook, Stages
 from pipeline.options import Evaluate, Select
 
 NAMES = sorted(f"{path.parent.name}/{path.stem}" for path in VARIANTS)
-LOCATIONS = frozenset({"weights", "revision", "path"})  # their content counts, see the tests of files
+LOCATIONS = frozenset({"weights", "unet", "revision", "path"})  # their content counts, see the tests of files
 K = (80.0, 80.0, 31.5, 23.5)
 
 
@@ -71,6 +71,11 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
         "extract/dinov2": {"weights": str(weights / "dinov2"), "input_size": 56},
         "extract/stable_diffusion": {"weights": str(weights / "sd"), "input_size": 64},
         "extract/bk_sdm": {"weights": str(weights / "sd"), "input_size": 64},
+        "extract/cleandift": {
+            "weights": str(weights / "sd"),
+            "input_size": 64,
+            "unet": str(weights / "sd" / "unet" / "diffusion_pytorch_model.safetensors"),
+        },
         "extract/fusion": {"first": variant("extract/hog"), "second": dino, "layers": ((2, 5), (8, 5), (5, 5))},
         "extract/embedded": {"input_size": 32},
         "extract/random_sd": {"input_size": 32},
@@ -107,6 +112,7 @@ def write_detections(path: Path) -> Path:
 
 # Fields without another value that this run accepts, and why.
 FIXED = {
+    "extract/cleandift": {"noise"},  # none
     "fuse/learned": {"layers"},  # what the head was trained on, see CONDITIONAL
 }
 # Values of other fields at which a field is left out of the key.
