@@ -168,6 +168,22 @@ def test_the_class_tokens_facet_is_that_of_the_last_block(folder: Path, facet: s
         extractor(folder, facet="token").feature_shape(CLASS_FACET_LAYER)
 
 
+def test_local_layers_are_those_of_a_smaller_input(folders: dict[str, Path]) -> None:
+    folder, crops, layers = folders["vit"], some_crops(), (2, SALIENCY_LAYER, 1, CLASS_FACET_LAYER)
+    both = extractor(folder, binned=[1], stride=4, input_size=64, local_size=24)
+    ours = both.load(CPU)(crops, layers)
+    assert list(ours) == list(layers)
+    for size, of_size in ((24, (1, SALIENCY_LAYER)), (64, (2, CLASS_FACET_LAYER))):
+        alone = features(folder, crops, of_size, binned=[1], stride=4, input_size=size)
+        for layer in of_size:
+            assert torch.equal(ours[layer], alone[layer])
+            assert tuple(ours[layer].shape[1:]) == both.feature_shape(layer)
+    plain = extractor(folder, binned=[1], stride=4, input_size=64)
+    assert "local_size" not in plain.recipe()
+    assert both.recipe()["local_size"] == 24
+    assert refusal(folder, local_size=30) == "extract.local_size: found 30, needs a multiple of the stride 8"
+
+
 def test_overlapping_patches_equal_plain_ones_of_the_shifted_image(folders: dict[str, Path], tmp_path: Path) -> None:
     # Without positions, what enters block 0, and so its keys, depends on each token's own patch alone. At stride 4
     # patch (2i+1, 2j+1) begins at pixel (8i+2, 8j+2): it is patch (i, j) of the image moved by 2 pixels up and left.

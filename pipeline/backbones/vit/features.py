@@ -12,7 +12,7 @@ cells would misplace tokens by up to (patch - stride) / 2 pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, ClassVar
@@ -50,9 +50,11 @@ class VitFeatures(Extractor):
     (``functional.binning``). ``norm_last``: tokens of any block (not keys, queries or values) go through the model's
     last layer norm. ``saliency_heads``: heads of the last block whose attention gives SALIENCY_LAYER (1 h w), None for
     all. CLASS_TOKEN_LAYER (c 1 1) is the class token after the last layer norm, CLASS_FACET_LAYER (c 1 1) its key,
-    query or value in the last block.
+    query or value in the last block. ``local_size``: side of the input for ``binned`` layers and saliency, which are
+    then read from a pass of their own; None: ``input_size``.
     """
 
+    added: ClassVar[Mapping[str, Any]] = {"local_size": None}
     model_types: ClassVar[tuple[str, ...]]
 
     weights: str
@@ -65,6 +67,7 @@ class VitFeatures(Extractor):
     norm_last: bool = False
     saliency_heads: tuple[NonNegative, ...] | None = None
     dtype: Dtype = "float32"
+    local_size: Positive | None = None
 
     @cached_property
     def source(self) -> TransformersFolder:
@@ -92,6 +95,11 @@ class VitFeatures(Extractor):
         """Pixels of the input from one token to the next."""
         return self.stride or self.sizes.patch
 
+    def size_of(self, layer: int) -> int:
+        """Side of the input (px) that a layer is read from."""
+        local = self.local_size is not None and (layer in self.binned or layer == SALIENCY_LAYER)
+        return (self.local_size if local else None) or self.input_size
+
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the weights' digest and the stride in pixels; fields without effect get fixed values."""
         recipe = super().recipe() | {"weights": self.weights_digest, "stride": self.stride_px}
@@ -104,7 +112,7 @@ class VitFeatures(Extractor):
     def feature_shape(self, layer: int) -> tuple[int, int, int]:
         """(c, h, w) of one crop's map. Raises BadInput for a layer, stride or input size the model does not have."""
         _check(self, (layer,))
-        cells, width = self.input_size // self.stride_px, self.sizes.width
+        cells, width = self.size_of(layer) // self.stride_px, self.sizes.width
         if layer in (CLASS_TOKEN_LAYER, CLASS_FACET_LAYER):
             return width, 1, 1
         if layer == SALIENCY_LAYER:
@@ -143,10 +151,18 @@ class VitBackbone:
 
     @torch.inference_mode()
     def _run_pass(self, crops: Crops, layers: Sequence[int]) -> FeatureMaps:
+        sizes = {layer: self.spec.size_of(layer) for layer in layers}
+        found: dict[int, Tensor] = {}
+        for size in dict.fromkeys(sizes.values()):
+            found |= self._read_layers(crops, [layer for layer in sizes if sizes[layer] == size], size=size)
+        return {layer: found[layer] for layer in sizes}
+
+    def _read_layers(self, crops: Crops, layers: Sequence[int], *, size: int) -> FeatureMaps:
+        """Maps of layers that are read from one input of ``size`` pixels a side."""
         s = self.spec
         found = read_block_tokens(
             self.model,
-            embed_patches(self.model, self._prepare_image(crops), stride=s.stride_px),
+            embed_patches(self.model, self._prepare_image(crops, size=size), stride=s.stride_px),
             layers=layers,
             facet=s.facet,
             norm_last=s.norm_last,
@@ -155,16 +171,16 @@ class VitBackbone:
         )
         return {layer: self._to_map(tokens, layer) for layer, tokens in found.items()}
 
-    def _prepare_image(self, crops: Crops) -> Float[Tensor, "n 3 R R"]:
-        """The image that patches are cut from: the crops at ``input_size``, padded and standardised."""
+    def _prepare_image(self, crops: Crops, *, size: int) -> Float[Tensor, "n 3 R R"]:
+        """The image that patches are cut from: the crops at ``size``, padded and standardised."""
         s = self.spec
         rgb = torch.from_numpy(np.ascontiguousarray(crops.rgb)).to(self.passes.device)
-        image = (to_network_image(rgb, size=s.input_size) + 1) / 2
+        image = (to_network_image(rgb, size=size) + 1) / 2
         padded = pad_border(image, overhang=s.sizes.patch - s.stride_px)
         return standardise(padded).to(getattr(torch, s.dtype))
 
     def _to_map(self, tokens: Float[Tensor, "n t c"], layer: int) -> Float[Tensor, "n d h w"]:
-        side = 1 if layer in (CLASS_TOKEN_LAYER, CLASS_FACET_LAYER) else self.spec.input_size // self.spec.stride_px
+        side = 1 if layer in (CLASS_TOKEN_LAYER, CLASS_FACET_LAYER) else self.spec.size_of(layer) // self.spec.stride_px
         maps = tokens.transpose(1, 2).unflatten(2, (side, side))
         return log_bin(maps, hierarchy=self.spec.hierarchy) if layer in self.spec.binned else maps
 
@@ -185,8 +201,9 @@ def _check(spec: VitFeatures, layers: Sequence[int]) -> None:
     if a.patch % spec.stride_px:
         divisors = ", ".join(str(n) for n in range(1, a.patch + 1) if a.patch % n == 0)
         raise BadInput("extract.stride", found=spec.stride, needed=f"a divisor of the patch size {a.patch}: {divisors}")
-    if spec.input_size % spec.stride_px:
-        raise BadInput("extract.input_size", found=spec.input_size, needed=f"a multiple of the stride {spec.stride_px}")
+    for field, size in (("input_size", spec.input_size), ("local_size", spec.local_size or 0)):
+        if size % spec.stride_px:
+            raise BadInput(f"extract.{field}", found=size, needed=f"a multiple of the stride {spec.stride_px}")
     if unknown := [layer for layer in spec.binned if layer > last]:
         raise BadInput("extract.binned", found=unknown[0], needed=f"0..{last}, the transformer's {a.depth} blocks")
     if SALIENCY_LAYER in layers and (not _heads(spec) or max(_heads(spec)) >= a.heads):
@@ -200,7 +217,7 @@ def _bytes_per_value(spec: VitFeatures) -> int:
 
 def _pass_footprint(spec: VitFeatures, device: str) -> Footprint:
     """Estimate of a pass from the maps in memory within a block and the widest map that is returned."""
-    cells = (spec.input_size // spec.stride_px) ** 2
+    cells = (max(spec.input_size, spec.local_size or 0) // spec.stride_px) ** 2
     maps = _LIVE_MAPS + 2 * len(set(spec.binned)) * bin_count(spec.hierarchy)
     bytes_per_crop = maps * spec.sizes.width * cells * _bytes_per_value(spec)
     max_batch = _MOST_CROPS[device]
