@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from command import CommandResult, run_dzop
 from make_weights import write_weights
+from test_sweep_files import composed
 from tiny_bop import write_tiny_bop
 
 from pipeline.bop.dataset import open_dataset
@@ -63,6 +64,15 @@ def test_a_method_is_one_override_on_masks_and_on_detections(dzop, tmp_path, met
         assert (row.status, row.config["method"]) == ("done", method)
         csv = tmp_path / "results" / row.folder / row.csv
         assert lint(csv, open_dataset(tmp_path / "tiny", name="tiny")).faults == ()
+
+
+def test_the_numbers_of_zs6d_are_those_of_its_code():
+    asked = composed("method=zs6d")
+    assert (asked["crop"]["size"], asked["crop"]["padding_ratio"]) == (224, 1.0)
+    assert (asked["extract"]["input_size"], asked["extract"]["local_size"], asked["extract"]["stride"]) == (224, 80, 4)
+    assert (asked["match"]["layer"], asked["match"]["class_token"], asked["fuse"]["layers"]) == (11, True, [9])
+    assert (asked["correspond"]["foreground"], asked["correspond"]["count"]) == ("saliency", 20)
+    assert (asked["solve"]["iterations"], asked["solve"]["threshold_px"]) == (100, 8.0)
 
 
 @pytest.mark.slow

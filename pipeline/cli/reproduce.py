@@ -26,7 +26,7 @@ Diffusion, and write one page with published and measured results. Run again to 
   datasets=[lmo]     some of lmo, ycbv, tless; the ablations belong to lmo
   images=20          at most so many images of each dataset, evenly spaced
   method=dzop_paper  the method in the paper's place
-  baselines=[zs6d]   further methods on the same masks (zs6d needs 43 MB of cache per image)
+  baselines=[zs6d]   further methods on the same masks (zs6d needs 8 MB of cache per image)
   data=data          folder of the datasets; what is there is not fetched
   detections=detections/cnos-fastsam.json   a detector's file, in each dataset's folder
   out=results/reproduction
