@@ -78,6 +78,44 @@ def tensor_shapes(model_type: str, *, depth: int, grid: int) -> dict[str, tuple[
     return shapes
 
 
+def write_dinov3(root: Path, *, depth: int = 3, gated: bool = False, seed: int = 0) -> Path:
+    """DINOv3 in the layout of the hub: blocks are named ``layer.k``, queries and values have biases, keys have none."""
+    c = WIDTH
+    shapes: dict[str, tuple[int, ...]] = {
+        "embeddings.cls_token": (1, 1, c),
+        "embeddings.mask_token": (1, 1, c),
+        "embeddings.register_tokens": (1, REGISTERS, c),
+        "embeddings.patch_embeddings.weight": (c, 3, 16, 16),
+        "embeddings.patch_embeddings.bias": (c,),
+        "norm.weight": (c,),
+        "norm.bias": (c,),
+    }
+    for i in range(depth):
+        block = f"layer.{i}."
+        linear = {f"attention.{x}_proj": (c, c) for x in "qkvo"} | {
+            "mlp.up_proj": (2 * c, c),
+            "mlp.down_proj": (c, 2 * c),
+        }
+        linear |= {"mlp.gate_proj": (2 * c, c)} if gated else {}
+        for name, shape in linear.items():
+            shapes |= {f"{block}{name}.weight": shape} | (
+                {} if "k_proj" in name else {f"{block}{name}.bias": shape[:1]}
+            )
+        shapes |= {f"{block}{name}": (c,) for name in ("norm1.weight", "norm1.bias", "norm2.weight", "norm2.bias")}
+        shapes |= {f"{block}layer_scale{k}.lambda1": (c,) for k in (1, 2)}
+    fields = {
+        "architectures": ["DINOv3ViTModel"], "model_type": "dinov3_vit", "hidden_size": c, "intermediate_size": 2 * c,
+        "num_hidden_layers": depth, "num_attention_heads": HEADS, "num_register_tokens": REGISTERS, "patch_size": 16,
+        "image_size": 224, "hidden_act": "silu" if gated else "gelu", "layer_norm_eps": 1e-5, "rope_theta": 100.0,
+        "query_bias": True, "key_bias": False, "value_bias": True, "proj_bias": True, "mlp_bias": True,
+        "use_gated_mlp": gated,
+    }  # fmt: skip
+    root.mkdir(parents=True)
+    (root / "config.json").write_text(json.dumps(fields))
+    save_file({name: _drawn(name, shape, seed) for name, shape in shapes.items()}, root / "model.safetensors")
+    return root
+
+
 def _drawn(name: str, shape: tuple[int, ...], seed: int) -> torch.Tensor:
     drawn = draw_gaussian(name, shape, seed=seed)
     if name.endswith(("lambda1", "norm.weight", "norm1.weight", "norm2.weight", "before.weight", "after.weight")):

@@ -31,6 +31,7 @@ PINS = Path(__file__).with_name("pins.json")
 UNPINNED = {
     "extract/stable_diffusion",
     "extract/bk_sdm",
+    "extract/dinov3",
     "extract/cleandift",
     "detect/json",
     "detect/photo",

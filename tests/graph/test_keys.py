@@ -15,7 +15,7 @@ import pytest
 from graph.perturbation import BASE, Perturbations, TinyRun, changed_specs, first_valid, variant
 from make_sam import write_sam
 from make_sd15 import write_folder
-from make_vit import write_vit
+from make_vit import write_dinov3, write_vit
 from safetensors.torch import load_file, save_file
 from test_configuration import VARIANTS
 from tiny_bop import FACES, edit_json, write_tiny_bop
@@ -43,6 +43,7 @@ def weights(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("weights")
     write_vit(root / "vit")
     write_vit(root / "dinov2", "dinov2_with_registers")
+    write_dinov3(root / "dinov3", depth=12)
     write_folder(root / "sd")
     write_sam(root / "sam")
     return root
@@ -69,6 +70,7 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
     given: dict[str, dict[str, Any]] = {
         "extract/dino": {"weights": str(weights / "vit"), "input_size": 64, "binned": (9,)},
         "extract/dinov2": {"weights": str(weights / "dinov2"), "input_size": 56},
+        "extract/dinov3": {"weights": str(weights / "dinov3"), "input_size": 64},
         "extract/stable_diffusion": {"weights": str(weights / "sd"), "input_size": 64},
         "extract/bk_sdm": {"weights": str(weights / "sd"), "input_size": 64},
         "extract/cleandift": {

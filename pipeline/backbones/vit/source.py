@@ -28,6 +28,7 @@ CLASSES = {
     "vit": "ViTModel",
     "dinov2": "Dinov2Model",
     "dinov2_with_registers": "Dinov2WithRegistersModel",
+    "dinov3_vit": "DINOv3ViTModel",
 }
 """model_type of a config -> the transformers class of the backbone without a head."""
 
@@ -87,7 +88,10 @@ class TransformersFolder:
         self._read_config()
         tensors = [path for path in self._list_tensors() if path.suffix == ".safetensors"]
         options = {"add_pooling_layer": False} if self._read_model_type() == "vit" else {}
-        return load_pretrained(CLASSES[self._read_model_type()], self.root, tensors, **options).to(dtype)
+        model = load_pretrained(CLASSES[self._read_model_type()], self.root, tensors, **options)
+        for parameter in model.parameters():  # buffers, such as the frequencies of a rotation, stay float32
+            parameter.data = parameter.data.to(dtype)
+        return model
 
     @property
     def _json(self) -> Path:
@@ -111,7 +115,11 @@ class TransformersFolder:
     def _read_config(self) -> Any:
         import transformers
 
-        cls: Any = getattr(transformers, CLASSES[self._read_model_type()].removesuffix("Model") + "Config")
+        name = CLASSES[self._read_model_type()].removesuffix("Model") + "Config"
+        cls: Any = getattr(transformers, name, None)
+        if cls is None:
+            found = f"transformers {transformers.__version__}, which has no {name}"
+            raise BadInput(self._json, found=found, needed="a newer transformers, or weights of another class")
         try:
             with silence_libraries():
                 return cls.from_dict(read_json(self._json))

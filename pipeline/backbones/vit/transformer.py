@@ -43,10 +43,13 @@ def embed_patches(model: Any, image: Float[Tensor, "n 3 S S"], *, stride: int) -
     Patches overlap where ``stride`` (px) is smaller than a patch (Amir et al., ECCVW 2022).
     """
     parts = model.embeddings
-    kernel = parts.patch_embeddings.projection
+    kernel = getattr(parts.patch_embeddings, "projection", parts.patch_embeddings)
     patches = conv2d(image, kernel.weight, kernel.bias, stride=stride)
     registers = getattr(parts, "register_tokens", None)
-    positions = parts.position_embeddings
+    positions = getattr(parts, "position_embeddings", None)
+    if positions is None:  # the blocks rotate queries and keys instead
+        unplaced = (parts.cls_token, parts.register_tokens, patches.flatten(2).transpose(1, 2))
+        return torch.cat([t.expand(len(image), -1, -1) for t in unplaced], dim=1)
     grid = resize_positions(positions[:, 1:], cells=patches.shape[-1], antialias=registers is not None)
     first = [parts.cls_token + positions[:, :1], *([] if registers is None else [registers])]
     tokens = patches.flatten(2).transpose(1, 2) + grid
@@ -66,6 +69,20 @@ def resize_positions(positions: Float[Tensor, "1 p c"], *, cells: int, antialias
     return resized.flatten(2).transpose(1, 2).to(positions.dtype)
 
 
+Rotation = tuple[Float[Tensor, "p d"], Float[Tensor, "p d"]]
+"""Cosines and sines by which DINOv3's attention rotates each head's queries and keys of the patches (RoPE)."""
+
+
+def rotate_patches(model: Any, tokens: Float[Tensor, "n t c"], *, skipped: int) -> Rotation | None:
+    """The rotation of a square of patches, each at its cell's centre in [-1, 1]; None for a model without."""
+    rope = getattr(model, "rope_embeddings", None)
+    if rope is None:
+        return None
+    side = round((tokens.shape[1] - skipped) ** 0.5) * int(model.config.patch_size)
+    cos, sin = rope(tokens.new_empty(1, 1, side, side))
+    return cos, sin
+
+
 def read_block_tokens(
     model: Any,
     tokens: Float[Tensor, "n t c"],
@@ -78,13 +95,15 @@ def read_block_tokens(
 ) -> dict[int, Float[Tensor, "n _t _c"]]:
     """Tokens of the given blocks without the first ``skipped`` ones (class token, registers).
 
-    Queries, keys and values are those of the block's attention, with all heads concatenated; "token" is the block's
-    output, after the model's last norm if ``norm_last``. Pseudo-layers: the class token (n 1 c), its attention (n t 1),
-    and its query, key or value in the last block (n 1 c).
+    Queries, keys and values are those of the block's attention before any rotation, with all heads concatenated;
+    "token" is the block's output, after the model's last norm if ``norm_last``. Pseudo-layers: the class token (n 1 c),
+    its attention (n t 1), and its query, key or value in the last block (n 1 c).
     """
     blocks = find_blocks(model)
     last = len(blocks) - 1
     deepest = last if min(layers, default=0) < 0 else max(layers, default=-1)
+    rotation = rotate_patches(model, tokens, skipped=skipped)
+    rotated = {} if rotation is None else {"position_embeddings": rotation}
     found: dict[int, Tensor] = {}
     for layer, block in enumerate(blocks[: deepest + 1]):
         if layer in layers and facet != "token":
@@ -92,15 +111,17 @@ def read_block_tokens(
         if layer == last and CLASS_FACET_LAYER in layers:
             found[CLASS_FACET_LAYER] = project_facet(block, tokens[:, :1], facet)
         if layer == last and SALIENCY_LAYER in layers:
-            found[SALIENCY_LAYER] = class_attention(block, tokens, heads=saliency_heads, model=model, skipped=skipped)
+            found[SALIENCY_LAYER] = class_attention(
+                block, tokens, heads=saliency_heads, model=model, skipped=skipped, rotation=rotation
+            )
         if layer == deepest and CLASS_TOKEN_LAYER not in layers and not (layer in layers and facet == "token"):
             break
-        output = block(tokens)
+        output = block(tokens, **rotated)
         tokens = output if isinstance(output, Tensor) else output[0]
         if layer in layers and facet == "token":
-            found[layer] = (model.layernorm(tokens) if norm_last else tokens)[:, skipped:]
+            found[layer] = (find_last_norm(model)(tokens) if norm_last else tokens)[:, skipped:]
     if CLASS_TOKEN_LAYER in layers:
-        found[CLASS_TOKEN_LAYER] = model.layernorm(tokens[:, :1])
+        found[CLASS_TOKEN_LAYER] = find_last_norm(model)(tokens[:, :1])
     return found
 
 
@@ -109,13 +130,25 @@ def find_blocks(model: nn.Module) -> nn.ModuleList:
     return next(module for module in model.modules() if isinstance(module, nn.ModuleList))
 
 
+def find_last_norm(model: Any) -> nn.Module:
+    """The norm after the last block."""
+    norm: nn.Module = getattr(model, "layernorm", None) or model.norm
+    return norm
+
+
 def project_facet(block: nn.Module, tokens: Float[Tensor, "n t c"], facet: str) -> Float[Tensor, "n t c"]:
     """Queries, keys or values of a block's attention, computed from the block's input tokens."""
     return find_submodule(block, _PROJECTIONS[facet])(find_submodule(block, _FIRST_NORM)(tokens))
 
 
 def class_attention(
-    block: nn.Module, tokens: Float[Tensor, "n t c"], *, heads: Sequence[int], model: Any, skipped: int
+    block: nn.Module,
+    tokens: Float[Tensor, "n t c"],
+    *,
+    heads: Sequence[int],
+    model: Any,
+    skipped: int,
+    rotation: Rotation | None,
 ) -> Float[Tensor, "n p 1"]:
     """Saliency: the class token's attention to every patch, averaged over ``heads``, scaled to [0, 1] in each image.
 
@@ -124,6 +157,11 @@ def class_attention(
     count = model.config.num_attention_heads
     query = project_facet(block, tokens[:, :1], "query").unflatten(-1, (count, -1))
     key = project_facet(block, tokens, "key").unflatten(-1, (count, -1))
+    if rotation is not None:
+        cos, sin = (value[:, None] for value in rotation)
+        first, second = key[:, skipped:].chunk(2, dim=-1)
+        turned = key[:, skipped:] * cos + torch.cat([-second, first], dim=-1) * sin
+        key = torch.cat([key[:, :skipped], turned], dim=1)
     scores = torch.einsum("nshd,nthd->nht", query.float(), key.float()) * key.shape[-1] ** -0.5
     attention = scores.softmax(-1)[:, list(heads), skipped:].mean(1)
     low, high = attention.amin(1, keepdim=True), attention.amax(1, keepdim=True)
