@@ -69,8 +69,8 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
     dino = variant("extract/dino", weights=str(weights / "vit"), input_size=64)
     given: dict[str, dict[str, Any]] = {
         "extract/dino": {"weights": str(weights / "vit"), "input_size": 64, "binned": (9,)},
-        "extract/dinov2": {"weights": str(weights / "dinov2"), "input_size": 56},
-        "extract/dinov3": {"weights": str(weights / "dinov3"), "input_size": 64},
+        "extract/dinov2": {"weights": str(weights / "dinov2"), "input_size": 56, "local_size": 28},
+        "extract/dinov3": {"weights": str(weights / "dinov3"), "input_size": 64, "local_size": 32},
         "extract/stable_diffusion": {"weights": str(weights / "sd"), "input_size": 64},
         "extract/bk_sdm": {"weights": str(weights / "sd"), "input_size": 64},
         "extract/cleandift": {
