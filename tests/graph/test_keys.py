@@ -68,7 +68,7 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
     """The base run's stages with one variant, and whatever it needs of the other stages."""
     dino = variant("extract/dino", weights=str(weights / "vit"), input_size=64)
     given: dict[str, dict[str, Any]] = {
-        "extract/dino": {"weights": str(weights / "vit"), "input_size": 64, "binned": (9,)},
+        "extract/dino": {"weights": str(weights / "vit"), "input_size": 64, "local_size": 32, "binned": (9,)},
         "extract/dinov2": {"weights": str(weights / "dinov2"), "input_size": 56, "local_size": 28},
         "extract/dinov3": {"weights": str(weights / "dinov3"), "input_size": 64, "local_size": 32},
         "extract/stable_diffusion": {"weights": str(weights / "sd"), "input_size": 64},
