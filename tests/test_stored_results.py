@@ -39,9 +39,12 @@ def test_a_store_of_an_older_commit_is_reused_where_results_did_not_change(folde
     ran = run_dzop(capsys, monkeypatch, *SMALL, *METHODS[name], "out=again")
     assert ran.status == 0, ran.err
     (counts,) = ran.counts()
-    assert {step for step, (computed, _) in counts.items() if computed} == RECOMPUTED
+    recomputed = RECOMPUTED | ({"template encodings"} if name == "embedded" else set())  # newer than the archive
+    assert {step for step, (computed, _) in counts.items() if computed} == recomputed
     assert {"templates", "template features", "query features"} <= counts.keys()
-    assert all(reused for step, (_, reused) in counts.items() if step not in RECOMPUTED)
+    assert all(reused for step, (_, reused) in counts.items() if step not in recomputed)
+    if name == "embedded":
+        return  # the first look became coarse: other poses, from the same features
     for now, before in zip(answers(folder / "again"), answers(folder / "results" / name), strict=True):
         assert now["template_id"] == before["template_id"]
         # mm; another processor's rounding turns a correspondence or two

@@ -46,6 +46,8 @@ def read_mask(path: Path, *, label: int | None = None) -> Bool[np.ndarray, "H W"
     with _open(path) as image:
         if label is not None and image.mode == "P":
             return select_object(np.asarray(image), path, label=label)  # labels are indices of the palette
+        if image.mode in ("CMYK", "YCbCr", "LAB", "HSV"):
+            image = image.convert("RGB")  # in CMYK, white is no ink
         values = np.asarray(image.convert("RGBA") if image.mode in ("P", "PA", "LA", "RGBA") else image)
     if values.ndim == 2 or values.shape[-1] != 4:
         return select_object(values, path, label=label)

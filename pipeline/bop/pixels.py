@@ -16,6 +16,7 @@ DEEP_GREY_VERSION = 2
 """Version of ``scale_to_8_bits``; in version 1 white was 65535. ``select_object`` counts as part of the detectors."""
 NEAR = 0.03  # of the largest value: how far compression moves a flat region from black or white
 SMALLEST_WHITE = 128  # integers below it are labels, not intensities
+_JUMP = 0.1  # of the largest value: a soft edge rises less from one pixel to the next
 COLOUR_NEAR = 0.4  # of the largest value: how far compression moves the colour of a mask
 MAX_LABELS_SHOWN = 8
 
@@ -53,7 +54,8 @@ def select_object(
 
     Two values: the object is where the mask is not black. More values, as compression and soft edges leave them: the
     object is above half of the largest. An image with flat regions of several values, or with several small integers,
-    labels instances: ``label`` chooses one, and without it BadInput lists the labels.
+    labels instances: ``label`` chooses one, and without it BadInput lists the labels. A photograph, whole or cut out on
+    black, is refused.
     """
     grey = values if values.ndim == 2 else values.max(axis=-1)
     if not np.isfinite(grey).all() or (grey.size and grey.min() < 0):
@@ -67,8 +69,25 @@ def select_object(
     bright = np.asarray(grey >= largest / 2)
     intensities = grey.dtype.kind == "f" or largest >= SMALLEST_WHITE
     if intensities and not _has_plateau(grey, largest) and _one_colour(values, bright):
+        if _is_photograph(grey, largest):
+            needed = "a mask: white on the object, black elsewhere"
+            raise BadInput(path, found="the shades of a photograph, whole or cut out", needed=needed)
         return bright
     raise _labels_error(values, grey, path)
+
+
+def _is_photograph(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
+    """Whether most pixels that are not black are not white either, and no soft edge explains it.
+
+    A soft edge rises gradually from black; a photograph cut out on black begins with its own shades, and a whole one
+    has hardly any black.
+    """
+    values = grey.astype(np.float32) / np.float32(largest)
+    black = values <= NEAR
+    between = np.count_nonzero(~black & (values < 1 - NEAR)) / max(1, np.count_nonzero(~black))
+    beside_black = (cv2.dilate(black.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~black
+    rise = float(np.median(values[beside_black])) if beside_black.any() else 0.0
+    return bool((between > 0.5 and rise > _JUMP) or (between > 0.9 and black.mean() < 0.2))
 
 
 def _has_plateau(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:

@@ -38,18 +38,21 @@ Intrinsics = tuple[float, float, float, float]
 def diagnose_camera(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], *, exif_orientation: int = 1) -> str:
     """What is implausible about K, the likely cause, and the K that would fit; "" for a plausible K.
 
-    Implausible: a principal point more than 15 % of a side off the image's centre, fx and fy that differ by more than a
-    fifth, or a K that fits the stored image better than the upright one where EXIF turns it. ``size_hw`` is that of the
-    upright image.
+    Implausible: a principal point more than 15 % of a side off the image's centre, or 10 % where cx and cy would be
+    central if exchanged, fx and fy that differ by more than a fifth, or a K that fits the stored image better than the
+    upright one where EXIF turns it. ``size_hw`` is that of the upright image.
     """
     given = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    turned = exif_orientation in _QUARTER_TURNS
-    sensor = turned and _offset(given, size_hw[::-1]) < _offset(given, size_hw)
-    if _is_plausible(given, size_hw) and not sensor:
-        return ""
     h, w = size_hw
     fx, fy, cx, cy = given
     found = f"K [{_text(given)}] is unusual for an image of {w} x {h} (width x height)"
+    turned = exif_orientation in _QUARTER_TURNS
+    sensor = turned and _offset(given, size_hw[::-1]) < _offset(given, size_hw)
+    if _is_plausible(given, size_hw) and not sensor:
+        exchanged = (fx, fy, cy, cx)
+        if _offset(given, size_hw) < CLOSE or _offset(exchanged, size_hw) > CLOSE / 2:
+            return ""
+        return f"{found}; cx and cy look exchanged: [{_text(exchanged)}]"
     if sensor or (w != h and _is_plausible(given, size_hw[::-1])):
         fitting = _turn(given, size_hw, exif_orientation)
         reason = "EXIF turns this photograph upright" if turned else "the picture may have been turned by 90 degrees"

@@ -24,6 +24,7 @@ MIN_PIXELS = 16  # smaller masks show no shape
 FULL_SHARE = 0.98  # of the image: such a mask is often inverted, or its colours are
 HALF_SHARE = 0.5  # of the image: a mask this large that also touches all four sides is often the background
 MAX_IDS = 10  # of objects in a warning
+LARGEST_DIAMETER_MM = 10_000.0  # of a mesh without a warning
 MANY_FACES = 1_000_000  # a mesh of more gets a warning with what it costs
 SECONDS_PER_MILLION, GB_PER_MILLION = 5.0, 0.5  # of faces, on one core: benchmarks/meshes.py
 OUTSIDE_SHARE = 0.1  # of a box outside the image: often two corners instead of corner, width and height
@@ -91,9 +92,17 @@ def mesh_warnings(context: Context, facts_of: Callable[[int], MeshFacts]) -> lis
         facts = facts_of(obj_id)
         if warning := context.dataset.model_warning(obj_id, facts):
             warnings.append(warning)
-        for text in (*facts.warnings, *_check_size(facts, context.dataset.simplify)):
+        for text in (*facts.warnings, *_check_diameter(facts), *_check_size(facts, context.dataset.simplify)):
             objects.setdefault(text, []).append(obj_id)
     return warnings + [f"{_describe_objects(obj_ids)}: {text}" for text, obj_ids in objects.items()]
+
+
+def _check_diameter(facts: MeshFacts) -> tuple[str, ...]:
+    """A diameter that few objects have: the usual cause is a scale for a mesh that is in millimetres already."""
+    if facts.diameter_mm <= LARGEST_DIAMETER_MM:
+        return ()
+    metres = facts.diameter_mm / 1000
+    return (f"its diameter is {metres:.4g} m: is it in millimetres, and dataset.scale for another unit?",)
 
 
 def _check_size(facts: MeshFacts, simplify: int | None) -> tuple[str, ...]:

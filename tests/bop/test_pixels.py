@@ -126,3 +126,42 @@ def test_an_image_too_large_is_called_too_large(tmp_path):
     Image.new("1", (40000, 10000)).save(tmp_path / "photo.tif", compression="group4")
     with pytest.raises(BadInput, match="40000 x 10000 pixels, 400 megapixels, needs at most 300"):
         image_size(tmp_path / "photo.tif")
+
+
+@pytest.fixture
+def shades() -> np.ndarray:
+    """A picture of random shades, smooth as photographs are, 120 x 160."""
+    noise = np.random.default_rng(3).random((120, 160, 3), dtype=np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 5)
+    return (30 + 220 * (smooth - smooth.min()) / np.ptp(smooth)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("cut", ["whole", "ball", "small ball", "grey ball", "half transparent"])
+def test_a_photograph_is_no_mask(tmp_path, shades, cut):
+    y, x = np.mgrid[:120, :160]
+    inside = (x - 80) ** 2 + (y - 60) ** 2 < (15 if cut == "small ball" else 40) ** 2
+    values = shades if cut in ("whole", "half transparent") else shades * inside[..., None]
+    values = values[..., 1] if cut == "grey ball" else values
+    if cut == "half transparent":
+        values = np.dstack([values, np.where(inside, 255, 128).astype(np.uint8)])
+    Image.fromarray(values).save(tmp_path / "cut.png")
+    with pytest.raises(BadInput, match=r"photograph|colours beside black"):
+        read_mask(tmp_path / "cut.png")
+
+
+@pytest.mark.parametrize("blur", [1, 3, 8])
+@pytest.mark.parametrize("radius", [12, 40])
+def test_a_soft_mask_is_no_photograph(tmp_path, blur, radius):
+    y, x = np.mgrid[:240, :320]
+    inside = (x - 160) ** 2 + (y - 120) ** 2 < radius**2
+    soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
+    Image.fromarray((255 * soft / soft.max()).round().astype(np.uint8)).save(tmp_path / "soft.png")
+    mask = read_mask(tmp_path / "soft.png")
+    assert 0.6 * inside.sum() < mask.sum() < 1.7 * inside.sum()
+
+
+def test_a_mask_of_ink_is_read_as_its_colours(tmp_path):
+    mask = np.zeros((40, 60), np.uint8)
+    mask[10:20, 15:40] = 255
+    Image.fromarray(mask).convert("RGB").convert("CMYK").save(tmp_path / "ink.tif")
+    np.testing.assert_array_equal(read_mask(tmp_path / "ink.tif"), mask > 0)

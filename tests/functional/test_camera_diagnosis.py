@@ -70,3 +70,13 @@ def test_unequal_focal_lengths_and_a_far_principal_point_are_reported_without_a_
 def test_a_camera_divided_by_the_images_size_is_recognised():
     assert denormalize_camera(matrix(0.9, 1.2, 0.5, 0.5), (480, 640)) == pytest.approx((576, 576, 320, 240))
     assert denormalize_camera(matrix(572, 573, 325, 242), (480, 640)) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "size_hw"), [((591, 590, 237, 308), (480, 640)), ((900, 900, 635, 480), (1280, 960))]
+)
+def test_an_exchanged_principal_point_is_named(values, size_hw):
+    fx, fy, cx, cy = values
+    said = diagnose_camera(matrix(*values), size_hw)
+    assert "cx and cy look exchanged" in said or "turned by 90 degrees" in said
+    assert diagnose_camera(matrix(fx, fy, cy, cx), size_hw) == ""

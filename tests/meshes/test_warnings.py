@@ -121,6 +121,13 @@ def test_other_diameters_of_models_info_are_said_by_cached_runs(capsys, monkeypa
         assert "mesh of objects 1, 2: it has no colours" in ran.out
 
 
+def test_a_mesh_of_more_than_ten_metres_is_said(dzop, tmp_path):
+    ran = dzop(write_plain_stl(tmp_path), "dataset.scale=1000", "plan=true")
+    assert ran.status == 0, ran.err
+    assert " m: is it in millimetres, and dataset.scale for another unit?" in ran.out
+    assert "is it in millimetres" not in dzop(write_plain_stl(tmp_path), "plan=true").out
+
+
 def test_a_mesh_of_many_faces_is_said_to_cost_time(dzop, tmp_path, monkeypatch):
     mesh = write_plain_stl(tmp_path)
     monkeypatch.setattr(checks, "MANY_FACES", 11)
