@@ -84,7 +84,7 @@ def _is_photograph(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
     """
     values = grey.astype(np.float32) / np.float32(largest)
     black = values <= NEAR
-    between = np.count_nonzero(~black & (values < 1 - NEAR)) / max(1, np.count_nonzero(~black))
+    between = float((values[~black] < 1 - NEAR).mean()) if not black.all() else 0.0
     beside_black = (cv2.dilate(black.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~black
     rise = float(np.median(values[beside_black])) if beside_black.any() else 0.0
     return bool((between > 0.5 and rise > _JUMP) or (between > 0.9 and black.mean() < 0.2))

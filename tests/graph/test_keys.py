@@ -95,6 +95,7 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
     others = {
         "fuse/learned": {"extract": variant("extract/embedded", input_size=128)},
         "correspond/salient": {"extract": dino},
+        "match/cosine": {"extract": dino},  # it has a class token
     }
     stage = name.partition("/")[0]
     return replace(BASE, **{stage: variant(name, **given.get(name, {}))}, **others.get(name, {}))
