@@ -267,7 +267,7 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
         ),
         (
             ("+match.topk=3",),
-            "found an unknown field, needs one of: layer, top_k; did you mean top_k?",
+            "found an unknown field, needs one of: layer, top_k, class_token; did you mean top_k?",
         ),
         (("match.top_k=0",), "match.top_k: found 0, needs greater than or equal to 1"),
         (("fuse.layers=[2,12]",), "fuse.layers: found 12, needs one of 2, 5, 8, 11"),
