@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from pipeline.bop.detections import Entry
 from pipeline.bop.jsonio import is_number
-from pipeline.bop.masks import decode_rle, read_segmentation, rle_area, rle_bbox
+from pipeline.bop.masks import decode_rle, polygon_corners, read_segmentation, rle_area, rle_bbox
 from pipeline.errors import BadInput
 from pipeline.items.views import Target
 
@@ -25,6 +25,7 @@ _MAX_CHECKED, _MAX_DECODED = 200, 20  # entries compared with their masks, and m
 _AGREE, _FITS = 0.5, 0.7
 """IoU of box and mask above which they agree (a box of the full silhouette may be larger than the visible mask), and
 above which another reading of the box explains a disagreement."""
+_BEYOND = 0.03  # share of the image's longer side that polygons may exceed it by
 _OUTSIDE = 0.1  # share of a box outside the image above which it does not fit the image
 
 _CORNERS = "two corners (x0, y0, x1, y1)"
@@ -97,8 +98,24 @@ def check_boxes_and_masks(
         warnings.append(
             f"{path.name}: {len(faults)} of {len(both)} boxes disagree with their masks (detection {index} {meaning})"
         )
+    warnings += _check_polygons(path, sample)
     alone = [(e.index, boxes[e.index], size_hw) for e, size_hw in sample if e.index in boxes and e.index not in masks]
     return warnings + _check_against_images(path, alone)
+
+
+def _check_polygons(path: Path, sample: Sequence[tuple[Entry, tuple[int, int]]]) -> list[str]:
+    """A warning about polygons that leave their images. Raises BadInput if all would fit with y before x."""
+    read = ((e.index, _read_corners(e.record, hw), hw) for e, hw in sample)
+    corners = {index: (found, hw) for index, found, hw in read if found is not None}
+    outside = [index for index, (found, hw) in corners.items() if _leaves(found, hw)]
+    if not outside:
+        return []
+    count = f"{len(outside)} of {len(corners)}"
+    if not any(_leaves(found[:, ::-1], hw) for found, hw in corners.values()):
+        found = f"polygons that look like y before x: all would fit their images so, and {count} leave them as x, y"
+        found += f" (first: detection {outside[0]})"
+        raise BadInput(f"{path}, field segmentation", found=found, needed="polygons [x, y, x, y, ...] in pixels")
+    return [f"{path.name}: {count} polygons leave their images (detection {outside[0]}); are they of another size?"]
 
 
 def _check_against_images(path: Path, boxes: Sequence[tuple[int, Xywh, tuple[int, int]]]) -> list[str]:
@@ -183,6 +200,20 @@ def _read_mask(record: dict[str, Any], size_hw: tuple[int, int]) -> dict[str, An
     except ValueError:
         return None
     return rle if rle and rle_area(rle) else None
+
+
+def _read_corners(record: dict[str, Any], size_hw: tuple[int, int]) -> Float[np.ndarray, "n 2"] | None:
+    try:
+        return polygon_corners(record.get("segmentation"), size_hw)
+    except ValueError:
+        return None
+
+
+def _leaves(corners: Float[np.ndarray, "n 2"], size_hw: tuple[int, int]) -> bool:
+    """Whether a corner lies outside the image by more than a tolerance."""
+    h, w = size_hw
+    beyond = np.maximum(-corners, corners - [w, h])
+    return bool((beyond > _BEYOND * max(w, h)).any())
 
 
 def _is_relative(box: Xywh) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from pycocotools import mask as coco
 
 from pipeline.bop.jsonio import is_number
@@ -41,11 +41,7 @@ def draw_polygons(polygons: list[Any], size_hw: tuple[int, int]) -> dict[str, An
     Each polygon is a list [x, y, x, y, ...] in pixels. A single polygon may be such a list itself, or a list of points
     [[x, y], ...]. Raises ValueError for anything else, and for corners that are parts of the image's size.
     """
-    if all(is_number(value) for value in polygons):
-        polygons = [polygons]
-    elif all(isinstance(point, list) and len(point) == 2 for point in polygons):
-        polygons = [[value for point in polygons for value in point]]
-    arrays = [_parse_polygon(polygon, size_hw) for polygon in polygons]
+    arrays = _parse_polygons(polygons, size_hw)
     if all(((array >= 0) & (array <= 1)).all() for array in arrays):
         raise ValueError("polygons have corners from 0 to 1, not in pixels")
     edges = sum(float(np.abs(np.diff(array.reshape(-1, 2), axis=0)).sum()) for array in arrays)
@@ -53,6 +49,21 @@ def draw_polygons(polygons: list[Any], size_hw: tuple[int, int]) -> dict[str, An
         raise ValueError(f"polygons have edges of {edges:.3g} pixels in total, too many for the image")
     rle = coco.merge(coco.frPyObjects([array.tolist() for array in arrays], *size_hw))
     return encode_rle(coco.decode(rle).astype(bool))
+
+
+def polygon_corners(segmentation: Any, size_hw: tuple[int, int]) -> Float[np.ndarray, "n 2"] | None:
+    """Corners (x, y) of all polygons of an entry; None for an entry without polygons. Raises ValueError."""
+    if not isinstance(segmentation, list) or not segmentation:
+        return None
+    return np.concatenate(_parse_polygons(segmentation, size_hw)).reshape(-1, 2)
+
+
+def _parse_polygons(polygons: list[Any], size_hw: tuple[int, int]) -> list[np.ndarray]:
+    if all(is_number(value) for value in polygons):
+        polygons = [polygons]
+    elif all(isinstance(point, list) and len(point) == 2 for point in polygons):
+        polygons = [[value for point in polygons for value in point]]
+    return [_parse_polygon(polygon, size_hw) for polygon in polygons]
 
 
 def _parse_polygon(polygon: Any, size_hw: tuple[int, int]) -> np.ndarray:

@@ -245,6 +245,22 @@ def test_polygons_are_drawn(read, write):
         np.testing.assert_array_equal(decode_rle(d.rle), mask)
 
 
+@pytest.mark.parametrize("box", [(W - 14, 5, 10, 10), (W - 13, 20, 12, 16)])
+def test_polygons_with_y_before_x_are_refused(read, box):
+    tall = [record | {"segmentation": [np.reshape(polygon(box), (4, 2))[:, ::-1].ravel().tolist()]}
+            for record in entries(masks=False)]  # fmt: skip
+    for record in tall:
+        del record["bbox"]
+    with pytest.raises(BadInput, match="y before x"):
+        read(tall)
+
+
+def test_polygons_of_a_larger_image_are_named(read):
+    larger = [record | {"segmentation": [polygon((2 * W - 60, 2 * H - 60, 50, 50))]} for record in entries(masks=False)]
+    _, warnings = read(larger)
+    assert any("polygons leave their images" in warning for warning in warnings)
+
+
 def coco(file_name: str, *, add: int = 0) -> dict[str, Any]:
     """The entries as a COCO annotation file, image ids raised by ``add``."""
     images = [{"id": i + add, "file_name": file_name.format(i), "width": W, "height": H} for i in (0, 3)]
