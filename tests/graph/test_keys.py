@@ -522,7 +522,10 @@ def test_every_file_of_weights_is_in_a_key(name: str, tiny: Path, weights: Path,
         folder = tmp_path / str(number)
         shutil.copytree(weights / name, folder)
         edit(folder)
-        perturbations.change(f"{name}: {change}", run(folder))
+        try:
+            perturbations.change(f"{name}: {change}", run(folder))
+        except BadInput:  # a broken tokenizer gives no tokens, so there is no key
+            assert "tokenizer" in change
         shutil.rmtree(folder)
     report(perturbations, f"weights of {name}", record_property)
 

@@ -436,5 +436,5 @@ def test_broken_or_missing_draco_is_named(path, monkeypatch):
     with pytest.raises(BadInput, match=r"a\.glb: found Draco data that cannot be decoded"):
         read_mesh(gltf.write(path))
     monkeypatch.setitem(__import__("sys").modules, "DracoPy", None)
-    with pytest.raises(BadInput, match=r"found a mesh compressed by Draco .* needs pip install 'dzop\[draco\]'"):
+    with pytest.raises(BadInput, match=r"a mesh compressed by Draco .* needs pip install --editable '\.\[draco\]'"):
         read_mesh(path)

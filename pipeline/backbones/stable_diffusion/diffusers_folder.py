@@ -129,7 +129,7 @@ def _run_tokenizer(text: str, folder: Path, length: int) -> Int[Tensor, "1 l"]:
     try:
         tokenizer = CLIPTokenizer.from_pretrained(str(folder), local_files_only=True)
         ids = tokenizer(text, padding="max_length", max_length=length, truncation=False)["input_ids"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except Exception as error:  # tokenizers raises Exception itself for files that contradict each other
         raise BadInput(folder, found=first_line(error), needed="the files of a CLIP tokenizer") from None
     if len(ids) > length:
         raise BadInput("extract.prompt", found=f"{len(ids)} tokens", needed=f"at most {length}, begin and end included")
