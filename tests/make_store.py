@@ -20,6 +20,8 @@ from pipeline.items.objects import Mesh
 from pipeline.synthetic import scenes
 
 ARCHIVE = Path(__file__).parent / "data" / "store.tar.xz"
+SAFELY: dict[str, str] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
+"""Arguments of extractall; Python 3.11.3 and earlier have no filter."""
 SMALL = (
     *("dataset=bop", "dataset.name=small", "dataset.root=scene", "store.root=cache", "crop.size=64", "match.top_k=2"),
     *("render=raycast", "render.size=64", "render.viewpoints=superfibonacci", "render.count=4"),

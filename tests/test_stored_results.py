@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import run_dzop
-from make_store import ARCHIVE, METHODS, SMALL
+from make_store import ARCHIVE, METHODS, SAFELY, SMALL
 
 from pipeline.stages.fuse.learned import Learned
 
@@ -15,7 +15,7 @@ from pipeline.stages.fuse.learned import Learned
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     with tarfile.open(ARCHIVE) as archive:
-        archive.extractall(tmp_path, filter="data")
+        archive.extractall(tmp_path, **SAFELY)
     monkeypatch.chdir(tmp_path)
     # the archive's features were made at 32 px, to be small; the head has refused all but 128 px since then
     monkeypatch.setattr(Learned, "check", lambda *_: None)

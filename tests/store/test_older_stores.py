@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from make_store import SAFELY
 
 from pipeline.store import DamagedEntry, Layout, LocalStoreConfig, Store, make_ref
 from pipeline.store.admin import check_is_store, collect_garbage, verify
@@ -41,7 +42,7 @@ def mask(rows) -> np.ndarray:
 @pytest.fixture(params=COMMITS)
 def store(request, tmp_path: Path) -> Store:
     with tarfile.open(ARCHIVE) as archive:
-        archive.extractall(tmp_path, filter="data")
+        archive.extractall(tmp_path, **SAFELY)
     return Store(LocalStoreConfig(root=str(tmp_path / request.param)))
 
 
