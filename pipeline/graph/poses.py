@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 from pipeline.errors import NoPose
+from pipeline.graph.bank import StoredBank
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import CroppedDetection, QueryNodes
 from pipeline.graph.tasks import Advance, Task
-from pipeline.graph.templates import StoredBank, TemplateNodes
+from pipeline.graph.templates import TemplateNodes
 from pipeline.graph.timings import timing_key
 from pipeline.hypotheses import template_pose
 from pipeline.items.online import Query, Trace, Truth

@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from pipeline.errors import DzopError
 from pipeline.fits import chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
-from pipeline.functional.masks import cell_mask
 from pipeline.functional.resample import resample
 from pipeline.functional.rigid import rigid
-from pipeline.functional.similarity import cell_norms, map_norms
+from pipeline.graph.bank import Matrix, Pose, StoredBank
 from pipeline.graph.context import Context, stack_crops, to_half
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
@@ -35,52 +33,6 @@ from pipeline.store import Entry, Layout, Ref, make_ref
 VIEWS_PER_BATCH = 8
 CROPS_PER_BATCH = 50
 RERENDER_SCALE = 2  # side of a rerendered view relative to its crop
-
-Pose = Float[np.ndarray, "4 4"]
-Matrix = Float[np.ndarray, "3 3"]
-
-
-@dataclass(eq=False)
-class StoredBank:
-    """One object's templates as input of the online route; views are read one by one, the last few stay in memory."""
-
-    layer: int
-    maps: Callable[[int], torch.Tensor]
-    masks: Callable[[], torch.Tensor]
-    view: Callable[[int], TemplateView]
-    draw: Callable[[Pose, Matrix, Matrix], TemplateView]
-    poses: Callable[[], np.ndarray]
-    fitted: Callable[[Fit], FittedArrays]
-
-    @cached_property
-    def features(self) -> torch.Tensor:
-        """Maps of the match layer, float16. They are an object's largest array, so they are read on first use."""
-        return self.maps(self.layer)
-
-    @cached_property
-    def norms(self) -> torch.Tensor:
-        """L2 norms of the flattened maps, float32; computed on first use."""
-        return map_norms(self.features)
-
-    @cached_property
-    def cell_norms(self) -> torch.Tensor:
-        """Lengths of the cells, float32; computed when a matcher first asks."""
-        return cell_norms(self.features)
-
-    @cached_property
-    def cell_mask(self) -> torch.Tensor:
-        """Foreground cells; computed when a matcher first asks."""
-        return cell_mask(self.mask, cells=self.features.shape[-1])
-
-    @cached_property
-    def mask(self) -> torch.Tensor:
-        """Crop masks of all templates; read on first use."""
-        return self.masks()
-
-    @cached_property
-    def T_cam_obj(self) -> np.ndarray:
-        """Poses of all templates; read on first use."""
-        return self.poses()
 
 
 @dataclass(eq=False)
