@@ -115,7 +115,8 @@ class Route:
             return first
         with self.clock("draw"):
             view = self.bank.draw(first.solution.T_cam_obj, self.query.A_crop_img, self.query.K)
-        second = self.solve(self.compare(Hypothesis(first.template_id, first.template_score, rerendered=view)))
+        start = Hypothesis(first.template_id, first.template_score, rerendered=view, first=first)
+        second = self.solve(self.compare(start))
         return first if second.solution is None else second
 
     def view(self, hypothesis: Hypothesis) -> TemplateView:
@@ -179,11 +180,10 @@ class Route:
         return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px**2))))
 
     def sort(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Highest score first; ties keep their order."""
-        if len(hypotheses) < 2:
-            return list(hypotheses)
+        """The hypotheses with their scores, highest first; ties keep their order."""
         with self.clock("choose"):
-            return sorted(hypotheses, key=self.score, reverse=True)
+            scored = [replace(h, score=self.score(h)) for h in hypotheses]
+            return sorted(scored, key=lambda h: h.score or 0.0, reverse=True)
 
     def score(self, hypothesis: Hypothesis) -> float:
         """Score of a hypothesis; -1, below all others, where it has no pose."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
+from pipeline.confidence.evidence import Extent, collect_evidence, measure_extent
 from pipeline.errors import NoPose
 from pipeline.graph.bank import StoredBank
 from pipeline.graph.context import Context, ImageId
@@ -16,15 +17,15 @@ from pipeline.graph.templates import TemplateNodes
 from pipeline.graph.timings import timing_key
 from pipeline.hypotheses import template_pose
 from pipeline.items.online import Query, Trace, Truth
-from pipeline.items.poses import NoEstimate, PoseEstimate
+from pipeline.items.poses import Alternative, NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
 from pipeline.method import ONLINE_STAGES
-from pipeline.route import trace_pose
+from pipeline.route import Route, trace_pose
 from pipeline.spec import digest
 from pipeline.store import Ref, make_ref
 
-POSES_VERSION = 3
+POSES_VERSION = 4
 
 
 @dataclass(eq=False)
@@ -61,6 +62,8 @@ class PoseNodes:
             inputs[f"fit {n}"] = self.templates.fitted(obj_id, fit).key
         if (encodings := self.templates.encodings(obj_id)) is not None:
             inputs["template encodings"] = encodings.key
+        if (info := self.context.dataset.models_info.get(obj_id)) is not None:  # otherwise measured on the mesh
+            inputs["object"] = digest([info.diameter_mm, info.symmetries.tolist()])
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.context.K(image).tolist()]
@@ -176,6 +179,7 @@ class PoseNodes:
         else:
             raise best.failure or NoPose("solve", "no hypothesis")
         count = 0 if matches is None else len(matches.similarity)
+        evidence, alternatives = self._evidence(trace, query, bank, d.obj_id)
         return PoseEstimate(
             scene_id=d.scene_id,
             im_id=d.im_id,
@@ -194,4 +198,21 @@ class PoseNodes:
             fallback=fallback,
             notes=best.notes,
             times_s={**shared_s, **trace.times_s},
+            evidence=evidence,
+            alternatives=alternatives,
         )
+
+    def _evidence(
+        self, trace: Trace, query: Query, bank: StoredBank, obj_id: int
+    ) -> tuple[dict[str, float], tuple[Alternative, ...]]:
+        """Evidence of a solved pose and its alternatives; nothing for a fallback."""
+        if trace.best.solution is None or trace.best.pair is None:
+            return {}, ()
+        route = Route(self.context.stages, query, bank)
+        geometry = route.geometry(route.view(trace.best), trace.best.pair)
+        return collect_evidence(trace, query, geometry, self._extent(obj_id))
+
+    @cached_property
+    def _extent(self) -> Callable[[int], Extent]:
+        """What distances between poses of an object are measured on."""
+        return lru_cache(maxsize=None)(lambda obj_id: measure_extent(self.context.model(obj_id)))

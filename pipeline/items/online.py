@@ -153,7 +153,8 @@ class TemplateBank(Protocol):
 class Hypothesis:
     """The pose that one template leads to; without a ``solution``, ``failure`` says which stage gave up and why.
 
-    ``rerendered``: the view rendered in the first solution's pose that this hypothesis was matched against.
+    ``rerendered``: the view that this hypothesis was matched against, rendered in the pose of its ``first`` look.
+    ``score``: by which it was chosen; None where it was not compared with others.
     """
 
     template_id: int
@@ -166,6 +167,8 @@ class Hypothesis:
     solution: PoseSolution | None = None
     failure: NoPose | None = None
     rerendered: TemplateView | None = None
+    first: Hypothesis | None = None
+    score: float | None = None
 
     @property
     def inliers(self) -> int:

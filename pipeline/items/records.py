@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from pipeline.items.errors import PoseErrors
-from pipeline.items.poses import NoEstimate, PoseEstimate
+from pipeline.items.poses import Alternative, NoEstimate, PoseEstimate
 from pipeline.items.scores import Scores
 from pipeline.items.views import Detection, Proposal
 
@@ -25,6 +25,11 @@ def answer_to_record(answer: Answer) -> dict[str, Any]:
     values = {f.name: getattr(answer, f.name) for f in fields(answer)}
     values["T_cam_obj"] = np.asarray(answer.T_cam_obj, float).tolist()
     values["notes"] = list(answer.notes)
+    values["evidence"] = dict(answer.evidence)
+    values["alternatives"] = [
+        {"T_cam_obj": np.asarray(a.T_cam_obj, float).tolist(), "support": a.support, "weight": a.weight}
+        for a in answer.alternatives
+    ]
     values["times_s"] = {stage: round(seconds, 6) for stage, seconds in answer.times_s.items()}
     return {"status": "estimate", **values}
 
@@ -36,6 +41,10 @@ def answer_from_record(record: Mapping[str, Any]) -> Answer:
         return NoEstimate(**values)
     values["T_cam_obj"] = np.array(values["T_cam_obj"], float)
     values["notes"] = tuple(values["notes"])
+    values["alternatives"] = tuple(
+        Alternative(**(record | {"T_cam_obj": np.array(record["T_cam_obj"], float)}))
+        for record in values.get("alternatives", ())
+    )
     return PoseEstimate(**values)
 
 

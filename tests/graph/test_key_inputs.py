@@ -25,7 +25,7 @@ import pipeline.graph.poses
 import pipeline.graph.queries
 import pipeline.graph.scores
 from pipeline.io.digests import track_files
-from pipeline.method import Stages
+from pipeline.method import SecondLook, Stages
 from pipeline.options import Evaluate
 from pipeline.spec import canonical, digest
 from pipeline.store import MemoryStoreConfig, Store
@@ -196,7 +196,7 @@ def changed_stages(way: str, stages: Stages) -> Iterator[dict[str, Any]]:
         yield {"solve": replace(stages.solve, min_inliers=10_000), "fallback": True}
         cosine = {"match": variant("match/cosine", top_k=3)}
         yield cosine
-        yield cosine | {"second_look": 2}
+        yield cosine | {"second_look": SecondLook(hypotheses=2)}
     elif way == "words":
         yield {"match": replace(stages.match, count=9)}
         yield {"match": replace(stages.match, dim=5)}
@@ -225,6 +225,12 @@ def runs_of(tmp_path: Path, weights: Path) -> Iterator[tuple[str, TinyRun]]:  # 
         for n, changed in enumerate(changed_stages(way, stages)):
             yield f"{way}, {n} {sorted(changed)}", bop(original, replace(stages, **changed))
     poses = ways_of(original, weights)["poses"]
+    looks = replace(poses, match=variant("match/cosine", top_k=3), second_look=SecondLook(hypotheses=2))
+    root = tmp_path / "looks diameter"
+    shutil.copytree(original, root)
+    FILES["diameter"](root)
+    yield "looks", bop(original, looks)
+    yield "looks, diameter", bop(root, looks)
     yield "poses, vsd_delta_mm", bop(original, poses, evaluate=Evaluate(vsd_delta_mm=0.01))
     yield "poses, correspondences", bop(original, poses, evaluate=Evaluate(correspondences=True))
     labels = {"mask": write_labels(original / "labels.png")}
