@@ -13,10 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
-from jaxtyping import install_import_hook
+import typecheck
 
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-install_import_hook(["pipeline"], "typecheck.check_types")
+typecheck.install(["pipeline"])
 torch.set_num_threads(int(os.environ.get("DZOP_TEST_THREADS", "2")))
 
 ROOT = Path(__file__).resolve().parents[1]

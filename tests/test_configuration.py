@@ -2,6 +2,7 @@
 
 import importlib
 from dataclasses import MISSING, fields
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,9 @@ STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond",
 VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.yaml"))
 
 
+@cache
 def loaded(path: Path) -> tuple[type, dict]:
-    """The class of a yaml and its fields, with the variants of its defaults list built."""
+    """The class of a yaml and its fields, with the variants of its defaults list built; not to be changed."""
     around = {"weights": OmegaConf.load(CONF / "config.yaml").weights, "variant": OmegaConf.load(path)}
     values = OmegaConf.to_container(OmegaConf.create(around), resolve=True)["variant"]
     for entry in values.pop("defaults", ()):

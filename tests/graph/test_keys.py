@@ -358,7 +358,9 @@ def test_entries_of_one_key_have_the_same_bytes_whatever_file_changed(reader: st
     check_files(tmp_path, reader, record_property, thorough=True)
 
 
-def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property):
+def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property, monkeypatch):
+    monkeypatch.setattr("pipeline.io.meshes.bake._SAMPLES", 20_000)  # a coarse bake of colours in seconds, not minutes
+    monkeypatch.setattr("pipeline.io.meshes.bake._TEXELS", 5_000)
     root = write_dataset(tmp_path / "original")
     mesh = write_obj(root / "models" / "box.obj")
     given: dict[str, Any] = {"mesh": str(mesh)}
