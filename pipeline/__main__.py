@@ -1,7 +1,8 @@
 """The command line: Hydra composes the configuration, ``pipeline.run`` runs it.
 
 ``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache`` manages the store, ``dzop fetch`` downloads
-datasets, ``dzop reproduce`` runs what the paper ran; ``dzop score`` and ``dzop lint`` read results files.
+datasets, ``dzop reproduce`` runs what the paper ran; ``dzop score`` and ``dzop lint`` read results files;
+``dzop symmetry`` finds symmetries of meshes.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from pipeline.cli.fetch import fetch_command
 from pipeline.cli.reproduce import reproduce_command
 from pipeline.cli.score import lint_command, score_command
 from pipeline.cli.sweep import SweepJobs, failures_text, record_failed_job, record_finished_job, same_answers_text
+from pipeline.cli.symmetry import symmetry_command
 from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
 from pipeline.configuration import (
     CONF,
@@ -57,6 +59,7 @@ COMMANDS = {
     "lint": lint_command,
     "reproduce": reproduce_command,
     "score": score_command,
+    "symmetry": symmetry_command,
 }
 RESUME = "Completed entries are cached; rerun to resume."
 READERS = ("__main__.py", "configuration.py")  # our modules whose frames may lie between Hydra's

@@ -1,1 +1,3 @@
-"""Commands other than running the pipeline: ``dzop cache``, ``fetch``, ``reproduce``, ``score``, ``lint``."""
+"""Commands other than running the pipeline: ``dzop cache``, ``fetch``, ``reproduce``, ``score``, ``lint``,
+``symmetry``.
+"""
