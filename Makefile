@@ -9,7 +9,7 @@ STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo photos pictures train-embedded benchmark-embedded ablations sweeps ladder comparison reproduce report bench test test-fast test-faults lint clean
+.PHONY: help setup gl demo photos pictures train-embedded benchmark-embedded confidence ablations sweeps ladder comparison reproduce report bench test test-fast test-faults lint clean
 
 PAPER := correspondence clusters pca_dim per_cluster timesteps theta
 OURS  := hook input_size template_layer layers noise viewpoints top_k solver
@@ -64,6 +64,9 @@ sweeps: $(STAMP) ## run ablations that are not in the paper, on the demo data
 
 ladder: $(STAMP) ## run the oracle ladder on the demo data: true mask, true template, true correspondences
 	@$(call sweep,ladder)
+
+confidence: $(STAMP) ## fit the confidence of poses on procedural scenes; ARGS="method=dzop --out dzop.json" for another method
+	$(PY) -m benchmarks.confidence $(ARGS)
 
 train-embedded: $(STAMP) ## train the embedded model, or resume; ARGS="--workers 15" with a GPU, ARGS="--batch 0.25 --scale 0.5 --minutes 600" without
 	$(PY) -m pipeline.embedded $(ARGS)

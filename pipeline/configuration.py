@@ -21,7 +21,7 @@ from pipeline.spec import build, did_you_mean
 PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
-OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method")
+OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method", "confidence")
 REQUIRED = (*STAGES, *OPTIONS, "second_look", "fallback", "dataset", "store", "runtime", "select", "evaluate")
 """Fields of config.yaml that a run needs and that ``~field`` on the command line can remove."""
 

@@ -85,7 +85,7 @@ class Options:
     """What to do and where to write the results.
 
     ``label``: variant of every stage; ``config``: the complete configuration; ``resume``: skip a run whose record says
-    that it is finished (jobs of a sweep).
+    that it is finished (jobs of a sweep). ``confidence``: see choose_calibration.
     """
 
     step: Literal["all", "onboard", "detect", "estimate", "evaluate", "report"]
@@ -101,6 +101,7 @@ class Options:
     label: Mapping[str, str]
     config: Mapping[str, Any]
     resume: bool = False
+    confidence: str = "auto"
 
     @property
     def name(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
@@ -12,11 +13,12 @@ import torch
 
 from pipeline.bop.dataset import Dataset
 from pipeline.bop.results import results_name
+from pipeline.confidence.calibration import choose_calibration, describe_confidence
 from pipeline.errors import BadInput, DzopError
 from pipeline.graph import Context, Graph, Node, PoseEvaluation, ScoreNodes, plan_costs, plan_table
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.io.digests import DigestCache, track_files
-from pipeline.items.poses import NoEstimate
+from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.method import Stages
 from pipeline.options import Options
@@ -57,7 +59,9 @@ def run(*, stages: Stages, dataset: DatasetSource, store: Store, runtime: Runtim
     folder = store.backend.folder
     with track_files(None if folder is None else DigestCache(folder / ".digests")):
         data = dataset.open()
-        context = Context(stages, data, options.select.targets(data), store, runtime, Progress(runtime.progress))
+        targets, progress = options.select.targets(data), Progress(runtime.progress)
+        calibration = choose_calibration(stages, options.confidence)
+        context = Context(stages, data, targets, store, runtime, progress, calibration=calibration)
         with store.in_use(), runtime.start_workers(context, threads=options.threads) as context.workers:
             graph = Graph(context)
             if options.plan:
@@ -163,7 +167,7 @@ def _estimate(graph: Graph, options: Options) -> str:
     pictures = Pictures(folder, answers, evaluation)
     if options.overlays:
         pictures.draw_overlays()
-    _print_results(answers, evaluation, folder.context.stages.detect.summary, theta_max=options.evaluate.theta_max)
+    _print_results(answers, evaluation, folder.context, options)
     _print_warnings(warnings)
     print(places_text(folder, overlays=options.overlays))
     if evaluation is not None:
@@ -214,7 +218,7 @@ def _score_nodes(graph: Graph, options: Options) -> ScoreNodes | None:
 
 
 def _print_results(
-    answers: Sequence[Answer], evaluation: PoseEvaluation | None, detections: str, *, theta_max: float
+    answers: Sequence[Answer], evaluation: PoseEvaluation | None, context: Context, options: Options
 ) -> None:
     rows = list(zip(answers, errors_by_answer(answers, evaluation), strict=True))
     print("\n" + (answers_table(rows) if len(rows) <= MAX_ROWS else objects_table(rows)))
@@ -223,13 +227,25 @@ def _print_results(
         print("\n" + failures_table(failures))
     reasons = " (each with its reason)" if failures else ""
     print(f"\nposes found: {len(answers) - len(failures)}, failed: {len(failures)}{reasons}")
+    print(_decisions_text(answers, context, options.confidence))
     if evaluation is None:
         return
-    print(f"\nscores on {detections}")
-    print(scores_table(evaluation.scored, theta_max=theta_max).lstrip("\n"))
+    print(f"\nscores on {context.stages.detect.summary}")
+    print(scores_table(evaluation.scored, theta_max=options.evaluate.theta_max).lstrip("\n"))
     if evaluation.correspondences:
         median = np.median(list(evaluation.correspondences.values()))
         print(f"correspondences: median error {median:.1%} of the diameter, parallel to the image plane")
+
+
+def _decisions_text(answers: Sequence[Answer], context: Context, choice: str) -> str:
+    """How many poses are to be accepted, checked and rejected, or why that is unknown."""
+    estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
+    note = describe_confidence(context.stages, context.calibration, choice)
+    if context.calibration is None:
+        return note or "confidence: none, as asked for"
+    counts = Counter(estimate.decision for estimate in estimates)
+    text = ", ".join(f"{name} {counts[name]}" for name in ("accept", "check", "reject"))
+    return "\n".join([f"decisions: {text}", *filter(None, [note])])
 
 
 def _headline(context: Context, options: Options) -> str:

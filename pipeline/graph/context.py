@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 
 from pipeline.bop.dataset import Dataset
+from pipeline.confidence.calibration import Calibration
 from pipeline.errors import BadInput, DzopError
 from pipeline.graph.lru import LRUCache
 from pipeline.graph.tasks import Advance, Item, Task, Workers
@@ -45,7 +46,8 @@ class Loadable(Protocol[Loaded]):
 class Context:
     """What all nodes of one run share: stages, data, store and step counts.
 
-    ``workers`` run tasks in other processes; None runs everything in this one.
+    ``workers`` run tasks in other processes; None runs everything in this one. ``calibration``: gives poses a
+    confidence; None where none fits the stages.
     """
 
     stages: Stages
@@ -55,6 +57,7 @@ class Context:
     runtime: Runtime
     progress: Progress = field(default_factory=Progress)
     workers: Workers | None = None
+    calibration: Calibration | None = None
     _mesh_digests: dict[int, str] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 from pipeline.confidence.evidence import Extent, collect_evidence, measure_extent
 from pipeline.errors import NoPose
@@ -76,8 +77,10 @@ class PoseNodes:
         return make_ref("poses", recipe, inputs)
 
     def run_ref(self) -> Ref:
-        """The run: the poses of all targets."""
-        return make_ref("runs", {"kind": "run"}, {f"{s}/{o}": self.poses((s, o)).key for s, o in self.groups})
+        """The run: the poses of all targets, with their confidence."""
+        calibration = self.context.calibration
+        recipe = {"kind": "run"} | ({} if calibration is None else {"calibration": calibration.digest})
+        return make_ref("runs", recipe, {f"{s}/{o}": self.poses((s, o)).key for s, o in self.groups})
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and one for every target without a detection."""
@@ -95,8 +98,15 @@ class PoseNodes:
         with self.context.progress.bar(total, "poses", "target") as advance:
             self.context.run_task(self.solve_task, sorted(missing, key=lambda group: group[1]), advance)
         made = [self.context.store.read(self.poses(group)).document["answers"] for group in self.groups]
-        records = [record for answers in made for record in answers]
+        records = [self._calibrate(record) for answers in made for record in answers]
         self.context.store.put_document(ref, {"answers": records}, rows=len(records))
+
+    def _calibrate(self, record: dict[str, Any]) -> dict[str, Any]:
+        """The record of an answer with its confidence, where a calibration fits the method."""
+        answer = answer_from_record(record)
+        if self.context.calibration is None or isinstance(answer, NoEstimate):
+            return record
+        return answer_to_record(self.context.calibration.apply(answer))
 
     def _make_queries(self, images: Sequence[ImageId]) -> None:
         with self.context.progress.bar(len(images), "query features", "image") as advance:

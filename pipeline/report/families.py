@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.report.run_records import NOT_IDENTIFYING, RunRecord
 
 # groups that do not change scores: records hold every threshold, and the runs of a section share their targets
-_SAME_SCORES = {"evaluate", "dataset", "select", "method", "variation"}
+_SAME_SCORES = {"evaluate", "dataset", "select", "method", "variation", "confidence"}
 # exceptions within these groups: fields that decide which meshes are rendered and how poses are scored
 _MESHES = {"dataset": ("models",), "evaluate": ("models", "vsd_delta_mm")}
 MAX_FAMILIES = 24

@@ -1,0 +1,274 @@
+"""Fit the confidence of a method's poses on procedural scenes, and measure it on scenes of seeds never used to fit.
+
+    python -m benchmarks.confidence                              # the default method; writes the file that ships
+    python -m benchmarks.confidence method=dzop --out dzop.json  # another method; use it with confidence=dzop.json
+
+A pose is right where its MSSD is below 20 % (and 10 %) of the diameter. Detections are those of an imitated detector;
+a part of them asks for an object that is not in the image. Prints tables in Markdown. Runs are cached.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from jaxtyping import Bool, Float
+from omegaconf import OmegaConf
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+
+from benchmarks.accuracy import path_override
+from benchmarks.run_pool import run_all
+from benchmarks.validation import Case, read_cases, write_validation
+from pipeline.bop.dataset import open_dataset
+from pipeline.confidence.calibration import SHIPPED, Calibration, Term, identify_stages
+from pipeline.configuration import CONF, build_stages
+from pipeline.errors import BadInput, DzopError
+from pipeline.io.files import write_json
+from pipeline.items.poses import PoseEstimate
+from pipeline.items.records import answer_from_record
+from pipeline.metrics.pose_error import hull_vertices, mssd
+
+FIT_SEEDS, TEST_SEEDS = (11,), (12,)
+OBJECTS, IMAGES = 14, 80
+VIEWS = 300
+LIMITS = (0.2, 0.1)
+"""Of the diameter: a pose with a smaller MSSD is right."""
+PRECISION = 0.95
+"""Share of accepted poses that are right, from which the threshold of "accept" follows."""
+REJECT_BELOW = 0.2
+TERMS = (
+    ("inliers", "log"),
+    ("inlier_ratio", "linear"),
+    ("inlier_ratio", "square"),
+    ("similarity", "linear"),
+    ("value", "log"),
+    ("cosine", "linear"),
+    ("coverage", "linear"),
+    ("agreeing", "linear"),
+    ("agreeing * agreeing", "linear"),
+    ("rival", "linear"),
+    ("rival", "square"),
+    ("template_score", "linear"),
+    ("template_margin", "log"),
+    ("overlap", "linear"),
+    ("explained", "linear"),
+    ("visible", "linear"),
+    ("moved", "log"),
+    ("reprojection", "log"),
+    ("crop_px", "log"),
+    ("mask_share", "linear"),
+    ("cosine * coverage", "linear"),
+    ("cosine * inlier_ratio", "linear"),
+    ("agreeing * cosine", "linear"),
+)
+"""Evidence that the model sums, each with its transform."""
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """A pose with its error over the diameter, infinite where another object's mesh was asked for.
+
+    ``rivals``: the errors of its alternatives.
+    """
+
+    estimate: PoseEstimate
+    case: Case
+    error: float
+    rivals: tuple[float, ...]
+
+
+def collect(folder: Path, seed: int, overrides: Sequence[str]) -> list[Example]:
+    """Make the scenes of a seed, estimate poses, and measure them."""
+    root = folder / "data" / f"{seed}_{OBJECTS}_{IMAGES}"
+    if not (root / "cases.json").is_file():
+        write_validation(root, seed=seed, objects=OBJECTS, images=IMAGES)
+    out = folder / "results" / f"{seed}"
+    data = ["dataset=bop", "dataset.name=confidence", path_override("dataset.root", root), f"render.count={VIEWS}"]
+    asked = ["detect=json", path_override("detect.path", root / "detections.json"), "detect.keep=all"]
+    places = [path_override("out", out), path_override("store.root", folder / "cache"), "confidence=none", "threads=1"]
+    quiet = ["step=estimate", "overlays=false", "gallery=0", "runtime.progress=false"]
+    run_all({("confidence", f"seed {seed}"): [*data, *asked, *places, *quiet, *overrides]}, jobs=1)
+    newest = max(out.glob("*/*/poses.json"), key=lambda path: path.stat().st_mtime)
+    records = json.loads(newest.read_text())["answers"]
+    return _measure(root, [{name: value for name, value in r.items() if name != "errors"} for r in records])
+
+
+def _measure(root: Path, records: Sequence[Mapping[str, Any]]) -> list[Example]:
+    data = open_dataset(root, name="confidence", targets="test_targets_bop19.json")
+    models = {k: data.object_model(k, folder="models_eval") for k in data.object_ids}
+    hulls = {k: hull_vertices(model.mesh.vertices) for k, model in models.items()}
+    cases = {(c.im_id, c.obj_id, c.nth): c for c in read_cases(root)}
+    examples = []
+    for answer in map(answer_from_record, records):
+        if not isinstance(answer, PoseEstimate):
+            continue
+        case, model = cases[answer.im_id, answer.obj_id, answer.detection_id], models[answer.obj_id]
+        poses = [answer.T_cam_obj, *(alternative.T_cam_obj for alternative in answer.alternatives)]
+        errors = [np.inf] * len(poses)
+        if case.T_cam_obj is not None:
+            T_true, hull = np.array(case.T_cam_obj), hulls[answer.obj_id]
+            errors = [mssd(T, T_true, hull, model.symmetries) / model.diameter_mm for T in poses]
+        examples.append(Example(answer, case, float(errors[0]), tuple(errors[1:])))
+    return examples
+
+
+def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[str, str], command: str) -> Calibration:
+    """The calibration of a method from its poses."""
+    available = {name for example in examples for name in example.estimate.evidence}
+    terms = [Term(n, t, 0.0, 1.0, 0.0, 0.0) for n, t in TERMS if set(n.split(" * ")) <= available]
+    terms = [_standardise(term, examples) for term in terms]
+    x, weights, biases = _values(terms, examples), [], []
+    for limit in LIMITS:
+        model = LogisticRegression(C=0.1, max_iter=2000).fit(x, [e.error < limit for e in examples])
+        weights.append(model.coef_[0])
+        biases.append(float(model.intercept_[0]))
+    fitted = [
+        replace(term, weight_20=round(float(a), 5), weight_10=round(float(b), 5))
+        for term, a, b in zip(terms, *weights, strict=True)
+    ]
+    calibration = Calibration(
+        kinds=kinds,
+        recipes=recipes,
+        terms=tuple(fitted),
+        bias_20=round(biases[0], 5),
+        bias_10=round(biases[1], 5),
+        accept=1.0,
+        reject=REJECT_BELOW,
+        rival_power=4.0,
+        rival_share=_share_of_rivals(examples),
+        command=command,
+        measured={},
+    )
+    return replace(calibration, accept=_accept_from(confidences(calibration, examples), right(examples)))
+
+
+def _standardise(term: Term, examples: Sequence[Example]) -> Term:
+    parts = term.name.split(" * ")
+    complete = [e for e in examples if set(parts) <= e.estimate.evidence.keys()]
+    raw = np.array([term.value(e.estimate.evidence) for e in complete])
+    wide = replace(term, scale=1e3)  # nothing is clipped
+    raw = 1e3 * np.array([wide.value(e.estimate.evidence) for e in complete])
+    return replace(term, mean=round(float(raw.mean()), 6), scale=round(float(max(raw.std(), 1e-6)), 6))
+
+
+def _values(terms: Sequence[Term], examples: Sequence[Example]) -> Float[np.ndarray, "n k"]:
+    return np.array([[term.value(e.estimate.evidence) for term in terms] for e in examples])
+
+
+def _share_of_rivals(examples: Sequence[Example]) -> float:
+    """Among wrong poses that have alternatives, the share that have the right pose among them."""
+    wrong = [e for e in examples if e.error >= LIMITS[0] and e.rivals]
+    return round(float(np.mean([any(rival < LIMITS[0] for rival in e.rivals) for e in wrong])), 3) if wrong else 0.0
+
+
+def _accept_from(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"]) -> float:
+    """The lowest confidence above which at least ``PRECISION`` of the poses are right, in steps of 0.01."""
+    for threshold in np.arange(0.5, 1.0, 0.01):
+        chosen = confidence >= threshold
+        if chosen.sum() and correct[chosen].mean() >= PRECISION:
+            return round(float(threshold), 2)
+    return 0.99
+
+
+def right(examples: Sequence[Example], limit: float = LIMITS[0]) -> Bool[np.ndarray, " n"]:
+    """Whether each pose is right."""
+    return np.array([e.error < limit for e in examples])
+
+
+def confidences(calibration: Calibration, examples: Sequence[Example]) -> Float[np.ndarray, " n"]:
+    """Confidence of each pose; 0 where it is unknown."""
+    return np.array([calibration.apply(e.estimate).confidence or 0.0 for e in examples])
+
+
+def calibration_error(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], *, bins: int = 10) -> float:
+    """ECE: mean distance between confidence and share of right poses, over bins of equal width, weighted by size."""
+    index = np.minimum((confidence * bins).astype(int), bins - 1)
+    parts = [(index == b) for b in range(bins)]
+    return float(sum(abs(confidence[p].mean() - correct[p].mean()) * p.mean() for p in parts if p.any()))
+
+
+def measure(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], accept: float) -> dict[str, float]:
+    """AUC of all poses and of those of the right mesh, calibration error, and what is accepted."""
+    correct, true_mesh = right(examples), np.array([e.case.T_cam_obj is not None for e in examples])
+    chosen = confidence >= accept
+    old = np.array([e.estimate.score for e in examples])
+    found = {
+        "poses": float(len(examples)),
+        "right": float(correct.mean()),
+        "AUC": float(roc_auc_score(correct, confidence)),
+        "AUC of the right mesh": float(roc_auc_score(correct[true_mesh], confidence[true_mesh])),
+        "AUC of the former score": float(roc_auc_score(correct, old)),
+        "calibration error": calibration_error(confidence, correct),
+        "accepted": float(chosen.mean()),
+        "right among accepted": float(correct[chosen].mean()) if chosen.any() else 1.0,
+        "accepted of the right ones": float(chosen[correct].mean()),
+    }
+    if not true_mesh.all():
+        found["accepted of wrong meshes"] = float(chosen[~true_mesh].mean())
+    return {name: round(value, 4) for name, value in found.items()}
+
+
+def coverage_table(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], accept: float) -> str:
+    """Markdown: what is right and accepted by visible fraction, poses of the right mesh."""
+    lines = ["| visible | poses | right | accepted | right among accepted |", "|---" * 5 + "|"]
+    for low, high in ((0.0, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.01)):
+        at = np.array([e.case.T_cam_obj is not None and low <= e.case.visible < high for e in examples])
+        if not at.any():
+            continue
+        correct, chosen = right(examples)[at], confidence[at] >= accept
+        among = f"{correct[chosen].mean():.3f}" if chosen.any() else "-"
+        shares = f"{correct.mean():.3f} | {chosen.mean():.3f} | {among}"
+        lines.append(f"| {low:.0%} to {min(high, 1):.0%} | {at.sum()} | {shares} |")
+    return "\n".join(lines)
+
+
+def benchmark(folder: Path, out: Path, overrides: Sequence[str]) -> str:
+    """Fit on the seeds for fitting, measure on those for testing, write the calibration; returns tables in Markdown."""
+    stages = _stages(overrides)
+    kinds, recipes = identify_stages(stages)
+    fitting = [e for seed in FIT_SEEDS for e in collect(folder, seed, overrides)]
+    testing = [e for seed in TEST_SEEDS for e in collect(folder, seed, overrides)]
+    command = " ".join(["python -m benchmarks.confidence", *overrides])
+    calibration = fit(fitting, kinds, recipes, command)
+    confidence = confidences(calibration, testing)
+    measured = measure(confidence, testing, calibration.accept)
+    calibration = replace(calibration, measured=measured)
+    write_json(out, asdict(calibration))
+    lines = ["| measured on seeds never used to fit | value |", "|---|---|"]
+    lines += [f"| {name} | {value:g} |" for name, value in measured.items()]
+    table = coverage_table(confidence, testing, calibration.accept)
+    return "\n".join([*lines, "", table, "", f"accepted from {calibration.accept:g}; written {out}"])
+
+
+def _stages(overrides: Sequence[str]) -> Any:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [*overrides])
+    return build_stages(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
+
+
+def main() -> None:
+    """Parse the options, fit, measure, print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.confidence", description=__doc__)
+    add, default = parser.add_argument, "(default: %(default)s)"
+    add("--folder", type=Path, default=Path("cache/confidence"), help=f"for scenes, cache and results {default}")
+    add("--out", type=Path, default=SHIPPED / "dzop_x.json", help=f"file of the calibration {default}")
+    add("overrides", nargs="*", help="the method, such as method=dzop")
+    options = parser.parse_intermixed_args()
+    if options.overrides and options.out == SHIPPED / "dzop_x.json":
+        parser.error("--out: found nothing, needs a file for the calibration of another method than the default")
+    try:
+        print(benchmark(options.folder.resolve(), options.out, options.overrides))
+    except (DzopError, BadInput) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

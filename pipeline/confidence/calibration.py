@@ -1,0 +1,179 @@
+"""evidence -> the probability that a pose is right: a logistic model whose coefficients are a JSON file.
+
+``python -m benchmarks.confidence`` fits it on procedural data and writes the file. A calibration belongs to one method:
+with other variants of the stages or other features, evidence means something else, and the confidence is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from pipeline.bop.jsonio import read_json
+from pipeline.errors import BadInput
+from pipeline.items.poses import Decision, PoseEstimate
+from pipeline.method import Stages
+from pipeline.spec import digest
+
+SHIPPED = Path(__file__).with_name("calibrations")
+CALIBRATED_STAGES = ("extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine")
+"""The stages whose variants a calibration belongs to."""
+
+_TRANSFORMS: Mapping[str, Callable[[float], float]] = {
+    "linear": float,
+    "log": lambda value: math.log(max(value, 1e-3)),
+    "square": lambda value: value * value,
+}
+
+
+@dataclass(frozen=True)
+class Term:
+    """A summand of the model: (transform(evidence[name]) - mean) / scale, times a weight for each threshold.
+
+    ``name`` may be a product of two, as "cosine * coverage". Missing evidence counts as its mean.
+    """
+
+    name: str
+    transform: str
+    mean: float
+    scale: float
+    weight_20: float
+    weight_10: float
+
+    def value(self, evidence: Mapping[str, float]) -> float:
+        """The standardised value; 0 where a part is missing."""
+        parts = [evidence.get(part) for part in self.name.split(" * ")]
+        if any(part is None for part in parts):
+            return 0.0
+        product = math.prod(float(part) for part in parts if part is not None)
+        return float(np.clip((_TRANSFORMS[self.transform](product) - self.mean) / self.scale, -6.0, 6.0))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A fitted model. ``kinds`` and ``recipes``: of the stages that it was fitted with, recipes as digests.
+
+    ``bias_20``, ``bias_10``: intercepts for the thresholds of 20 % and 10 % of the diameter. A pose is accepted from a
+    confidence of ``accept`` on and rejected below ``reject``. ``rival_power`` and ``rival_share``: how the probability
+    that the pose is wrong is shared among its alternatives. ``command`` made the file; ``measured`` says how well it
+    does.
+    """
+
+    kinds: Mapping[str, str]
+    recipes: Mapping[str, str]
+    terms: tuple[Term, ...]
+    bias_20: float
+    bias_10: float
+    accept: float
+    reject: float
+    rival_power: float
+    rival_share: float
+    command: str
+    measured: Mapping[str, Any]
+
+    @property
+    def digest(self) -> str:
+        """Digest of all that changes a confidence."""
+        content = {name: value for name, value in asdict(self).items() if name not in ("command", "measured")}
+        return digest(content | {"terms": [asdict(term) for term in self.terms]})
+
+    def apply(self, estimate: PoseEstimate) -> PoseEstimate:
+        """The estimate with confidence, decision, the weights of its alternatives, and its confidence as score.
+
+        A fallback has no evidence: its confidence stays unknown, and it is rejected.
+        """
+        if not estimate.evidence:
+            return replace(estimate, score=0.0, decision="reject")
+        values = [term.value(estimate.evidence) for term in self.terms]
+        weights = [(term.weight_20, term.weight_10) for term in self.terms]
+        sum_20, sum_10 = np.array(values) @ np.array(weights)
+        confidence = _logistic(self.bias_20 + sum_20)
+        return replace(
+            estimate,
+            score=confidence,
+            confidence=confidence,
+            confidence_10=min(confidence, _logistic(self.bias_10 + sum_10)),
+            decision=self.decide(confidence),
+            alternatives=self._weigh(estimate, confidence),
+        )
+
+    def decide(self, confidence: float) -> Decision:
+        """What to do with a pose of this confidence."""
+        if confidence >= self.accept:
+            return "accept"
+        return "check" if confidence >= self.reject else "reject"
+
+    def _weigh(self, estimate: PoseEstimate, confidence: float) -> tuple[Any, ...]:
+        """The alternatives with their probabilities: a share of what the estimate's own leaves, by their support."""
+        powers = [alternative.support**self.rival_power for alternative in estimate.alternatives]
+        total = max(sum(powers), 1e-12)
+        left = (1 - confidence) * self.rival_share
+        return tuple(
+            replace(alternative, weight=left * power / total)
+            for alternative, power in zip(estimate.alternatives, powers, strict=True)
+        )
+
+
+def choose_calibration(stages: Stages, choice: str) -> Calibration | None:
+    """The calibration of a method. ``choice``: "auto" (a shipped one, None without one), "none", or a JSON file.
+
+    Raises BadInput for a file that was fitted with other variants of stages.
+    """
+    if choice == "none":
+        return None
+    kinds, _ = identify_stages(stages)
+    if choice != "auto":
+        chosen = read_calibration(Path(choice).expanduser())
+        if other := [name for name in kinds if chosen.kinds.get(name) != kinds[name]]:
+            found = f"{choice}, fitted with {chosen.kinds.get(other[0])} as {other[0]}"
+            raise BadInput("confidence", found=found, needed=f"a calibration for {kinds[other[0]]}, auto or none")
+        return chosen
+    shipped = (read_calibration(path) for path in sorted(SHIPPED.glob("*.json")))
+    return next((calibration for calibration in shipped if calibration.kinds == kinds), None)
+
+
+def identify_stages(stages: Stages) -> tuple[dict[str, str], dict[str, str]]:
+    """Kind, and digest of the recipe, of every stage that a calibration belongs to."""
+    parts = {name: getattr(stages, name) for name in CALIBRATED_STAGES}
+    kinds = {name: part.kind for name, part in parts.items()}
+    kinds["second look"] = "drawn" if stages.second_look.hypotheses else "none"
+    recipes = {name: digest(part.recipe()) for name, part in parts.items()}
+    return kinds, recipes | {"second look": digest(stages.second_look.recipe())}
+
+
+def describe_confidence(stages: Stages, calibration: Calibration | None, choice: str) -> str:
+    """A warning where poses have no confidence, or one that was fitted with other settings; "" otherwise."""
+    if choice == "none":
+        return ""
+    refit = "python -m benchmarks.confidence fits one"
+    if calibration is None:
+        return f"poses have no confidence: none was fitted for this method and these features; {refit}"
+    _, recipes = identify_stages(stages)
+    other = [name for name, recipe in recipes.items() if calibration.recipes.get(name) != recipe]
+    if not other:
+        return ""
+    return f"confidence was fitted with other settings of {', '.join(other)}; {refit}"
+
+
+@cache
+def read_calibration(path: Path) -> Calibration:
+    """The calibration in a JSON file. Raises BadInput."""
+    content = read_json(path)
+    try:
+        return TypeAdapter(Calibration).validate_python(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "content"
+        needed = "a file that python -m benchmarks.confidence wrote"
+        raise BadInput(f"{path}, field {field}", found=first["msg"].lower(), needed=needed) from None
+
+
+def _logistic(x: float) -> float:
+    return 1 / (1 + math.exp(-float(np.clip(x, -30, 30))))
