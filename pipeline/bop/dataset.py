@@ -112,6 +112,11 @@ class Dataset:
         return False
 
     @property
+    def finds_symmetries(self) -> bool:
+        """Whether symmetries are found on the meshes, because nothing states them."""
+        return False
+
+    @property
     def image_note(self) -> str:
         """What was done to the images beyond reading them; pictures say it."""
         return ""

@@ -160,6 +160,11 @@ class Photo(Dataset):
         return True
 
     @property
+    def finds_symmetries(self) -> bool:
+        """True: own meshes have no models_info.json."""
+        return True
+
+    @property
     def image_note(self) -> str:
         """That pictures show the photograph without distortion."""
         return "" if self.lens is None else "undistorted photograph"

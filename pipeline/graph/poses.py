@@ -8,8 +8,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.bop.symmetries import SYMMETRIES_VERSION, mesh_symmetries, transforms_of
 from pipeline.confidence.evidence import Extent, collect_evidence, measure_extent
 from pipeline.errors import NoPose
+from pipeline.functional.symmetry import make_canonical
 from pipeline.graph.bank import StoredBank
 from pipeline.graph.context import Context, ImageId
 from pipeline.graph.queries import CroppedDetection, QueryNodes
@@ -65,6 +70,8 @@ class PoseNodes:
             inputs["template encodings"] = encodings.key
         if (info := self.context.dataset.models_info.get(obj_id)) is not None:  # otherwise measured on the mesh
             inputs["object"] = digest([info.diameter_mm, info.symmetries.tolist()])
+        elif self.context.dataset.finds_symmetries:
+            inputs["object"] = digest(["found", SYMMETRIES_VERSION])
         for target in self.groups[group]:
             image = (target.scene_id, target.im_id)
             asked = [target.inst_count, self.context.K(image).tolist()]
@@ -195,7 +202,7 @@ class PoseNodes:
             im_id=d.im_id,
             obj_id=d.obj_id,
             detection_id=nth,
-            T_cam_obj=T_cam_obj,
+            T_cam_obj=self._canonical(T_cam_obj, d.obj_id),
             score=d.score * best.inliers / max(count, 1),
             detection_score=d.score,
             template_id=best.template_id,
@@ -209,7 +216,7 @@ class PoseNodes:
             notes=best.notes,
             times_s={**shared_s, **trace.times_s},
             evidence=evidence,
-            alternatives=alternatives,
+            alternatives=tuple(replace(a, T_cam_obj=self._canonical(a.T_cam_obj, d.obj_id)) for a in alternatives),
         )
 
     def _evidence(
@@ -225,4 +232,16 @@ class PoseNodes:
     @cached_property
     def _extent(self) -> Callable[[int], Extent]:
         """What distances between poses of an object are measured on."""
-        return lru_cache(maxsize=None)(lambda obj_id: measure_extent(self.context.model(obj_id)))
+        return lru_cache(maxsize=None)(self._measure_extent)
+
+    def _measure_extent(self, obj_id: int) -> Extent:
+        model = self.context.model(obj_id)
+        if self.context.dataset.finds_symmetries:
+            model = replace(model, symmetries=transforms_of(mesh_symmetries(model.mesh, model.diameter_mm)[1]))
+        return measure_extent(model)
+
+    def _canonical(self, T_cam_obj: Float[np.ndarray, "4 4"], obj_id: int) -> Float[np.ndarray, "4 4"]:
+        """The pose, or that of its symmetric copies that stands for all of them where symmetries were found."""
+        if not self.context.dataset.finds_symmetries:
+            return T_cam_obj
+        return make_canonical(T_cam_obj, self._extent(obj_id).symmetries)
