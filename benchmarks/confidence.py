@@ -37,7 +37,7 @@ from pipeline.items.records import answer_from_record
 from pipeline.metrics.pose_error import hull_vertices, mssd
 
 FIT_SEEDS, TEST_SEEDS = (11,), (12,)
-OBJECTS, IMAGES = 14, 80
+OBJECTS, IMAGES = 10, 48
 VIEWS = 300
 LIMITS = (0.2, 0.1)
 """Of the diameter: a pose with a smaller MSSD is right."""

@@ -14,7 +14,7 @@ from pydantic.dataclasses import is_pydantic_dataclass
 
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import NotDownloaded
-from pipeline.method import SecondLook, Stages
+from pipeline.method import DepthFit, SecondLook, Stages
 from pipeline.options import Evaluate, Options, Select
 from pipeline.spec import build, did_you_mean
 
@@ -22,7 +22,7 @@ PACKAGE = Path(__file__).resolve().parent
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
 OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method", "confidence")
-REQUIRED = (*STAGES, *OPTIONS, "second_look", "fallback", "dataset", "store", "runtime", "select", "evaluate")
+REQUIRED = (*STAGES, *OPTIONS, "second_look", "depth", "fallback", "dataset", "store", "runtime", "select", "evaluate")
 """Fields of config.yaml that a run needs and that ``~field`` on the command line can remove."""
 
 OWN_CLASS_WARNING = (
@@ -46,7 +46,8 @@ def build_stages(values: Mapping[str, Any]) -> Stages:
     if not isinstance(values["fallback"], bool):
         raise BadInput("fallback", found=repr(values["fallback"]), needed="true or false")
     second_look: SecondLook = build_variant(values["second_look"], "second_look")
-    return Stages(**stages, fallback=values["fallback"], second_look=second_look)
+    depth: DepthFit = build_variant(values["depth"], "depth")
+    return Stages(**stages, fallback=values["fallback"], second_look=second_look, depth=depth)
 
 
 def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options:

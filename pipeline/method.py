@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pipeline.fits import chain
 from pipeline.items.features import SALIENCY_LAYER
@@ -46,6 +46,21 @@ class SecondLook(Spec):
     enough: Fraction = 1.0
 
 
+@spec
+class DepthFit(Spec):
+    """Fit poses to a depth image: along the viewing ray, then ``rounds`` of iterated closest points.
+
+    ``use``: "never"; "given": where the configuration gives a depth image (dataset=photo); "always": every image needs
+    one. It is no part of the method, which uses RGB: results with depth are marked.
+    """
+
+    kind: ClassVar[str] = "depth fit"
+    version: ClassVar[int] = 1
+
+    use: Literal["never", "given", "always"] = "never"
+    rounds: NonNegative = 12
+
+
 @dataclass(frozen=True)
 class Stages:
     """The variant of each stage.
@@ -66,6 +81,7 @@ class Stages:
     detect: Detector
     fallback: bool = False
     second_look: SecondLook = field(default_factory=SecondLook)
+    depth: DepthFit = field(default_factory=DepthFit)
 
     @property
     def oracle(self) -> str:

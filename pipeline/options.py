@@ -105,8 +105,10 @@ class Options:
 
     @property
     def name(self) -> str:
-        """Method and extractor; without underscores, as BOP's format requires of file names."""
-        return f"{self.method}-{self.label['extract']}".replace("_", "-")
+        """Method and extractor, "rgbd" with depth; without underscores, as BOP's format requires of file names."""
+        use, given = self.config["depth"]["use"], self.config["dataset"].get("depth")
+        depth = "-rgbd" if use == "always" or (use == "given" and given) else ""
+        return f"{self.method}-{self.label['extract']}{depth}".replace("_", "-")
 
     @property
     def file_name(self) -> str:

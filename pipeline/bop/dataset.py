@@ -26,7 +26,7 @@ from pipeline.io.digests import file_exists
 from pipeline.io.meshes import prepared_digest
 from pipeline.items.objects import MeshFacts, ObjectModel
 from pipeline.items.views import Image, Target
-from pipeline.spec import FaceCount, spec
+from pipeline.spec import FaceCount, digest, spec
 
 # Box diagonals. The largest offset over the targets of LM-O and YCB-V in the tests is 0.13; a K for an image of half
 # the size gives 0.9 or more.
@@ -109,6 +109,11 @@ class Dataset:
     @property
     def requires_pose(self) -> bool:
         """Whether a run without a single pose has failed, rather than measured that there is none."""
+        return False
+
+    @property
+    def gives_depth(self) -> bool:
+        """Whether the configuration itself names a depth image, so that poses are to be fitted to it."""
         return False
 
     @property
@@ -201,6 +206,11 @@ class Dataset:
             where = describe_place(self.scene(scene_id).path("scene_camera.json"), scene=scene_id, image=im_id)
             raise BadInput(f"{where}, field depth_scale", found="nothing", needed="mm per unit of the depth image")
         return read_depth(self.depth_path(scene_id, im_id), scale)
+
+    def depth_identity(self, scene_id: int, im_id: int) -> str:
+        """Digest of the measured depth. Raises BadInput where there is no depth image."""
+        content = image_digest(self.depth_path(scene_id, im_id), photograph=False)
+        return digest([content, self.scene(scene_id).camera(im_id).depth_scale])
 
     def has_ground_truth(self, scene_id: int) -> bool:
         """Whether the scene is annotated."""

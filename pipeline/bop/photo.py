@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.bop.dataset import Dataset
-from pipeline.bop.images import QUARTER_TURNS, image_digest, image_size, read_mask, read_orientation, read_rgb
+from pipeline.bop.images import (
+    QUARTER_TURNS,
+    image_digest,
+    image_size,
+    read_depth,
+    read_mask,
+    read_orientation,
+    read_rgb,
+)
 from pipeline.bop.jsonio import is_number
 from pipeline.bop.lens import Lens, parse_lens
 from pipeline.bop.scene import Box, check_K, xyxy_from_xywh
@@ -35,7 +43,8 @@ class PhotoConfig(Spec):
     object's value in a mask that labels several. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres.
     ``distortion``: k1, k2, p1, p2[, k3[, k4, k5, k6]] of OpenCV's model; the photograph, the mask and the box are
     undistorted before anything else.
-    ``simplify``: most faces of a mesh, None for all.
+    ``simplify``: most faces of a mesh, None for all. ``depth``: depth image of the photograph's size, ``depth_scale``
+    mm per unit.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -49,6 +58,8 @@ class PhotoConfig(Spec):
     scale: PositiveFloat = 1.0
     distortion: tuple[Any, ...] | str | None = None
     simplify: FaceCount | None = None
+    depth: str | None = None
+    depth_scale: PositiveFloat = 1.0
     name: str = "photo"
 
     def open(self) -> Photo:
@@ -71,6 +82,8 @@ class PhotoConfig(Spec):
             )
         if self.bbox is not None:
             _check_box(self.bbox)
+        if self.depth is not None:
+            self._check_depth(Path(self.depth).expanduser(), size_hw)
         return Photo(
             name=self.name,
             root=image.parent,
@@ -87,7 +100,18 @@ class PhotoConfig(Spec):
             scale=self.scale,
             lens=None if self.distortion is None else parse_lens(self.distortion, K, size_hw),
             simplify=self.simplify,
+            depth_file=None if self.depth is None else Path(self.depth).expanduser(),
+            depth_scale=self.depth_scale,
         )
+
+    def _check_depth(self, path: Path, size_hw: tuple[int, int]) -> None:
+        """Raise BadInput for a depth image of another size, and for one of a photograph with distortion."""
+        (h, w), found = size_hw, image_size(path)
+        if found != size_hw:
+            needed = f"those of the photograph, {w} x {h} (width x height): register depth to colour first"
+            raise BadInput(path, found=f"{found[1]} x {found[0]} pixels", needed=needed)
+        if self.distortion is not None:
+            raise BadInput("dataset.depth", found="with dataset.distortion", needed="an undistorted pair of images")
 
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
         flat = [value for row in self.K for value in (row if isinstance(row, tuple) else (row,))]
@@ -137,6 +161,27 @@ class Photo(Dataset):
     bbox_xyxy: Box | None = None
     scale: float = 1.0
     lens: Lens | None = None
+    depth_file: Path | None = None
+    depth_scale: float = 1.0
+
+    @property
+    def gives_depth(self) -> bool:
+        """Whether the configuration names a depth image."""
+        return self.depth_file is not None
+
+    def depth_path(self, scene_id: int, im_id: int) -> Path:
+        """The depth image's file. Raises BadInput without one."""
+        if self.depth_file is None:
+            raise BadInput("dataset.depth", found="nothing", needed="a depth image, or depth=given")
+        return self.depth_file
+
+    def depth_mm(self, scene_id: int, im_id: int) -> Float32[np.ndarray, "H W"]:
+        """Measured depth along the optical axis, mm; 0 where unknown."""
+        return read_depth(self.depth_path(scene_id, im_id), self.depth_scale)
+
+    def depth_identity(self, scene_id: int, im_id: int) -> str:
+        """Digest of the measured depth."""
+        return digest([image_digest(self.depth_path(scene_id, im_id), photograph=False), self.depth_scale])
 
     @property
     def location_field(self) -> str:

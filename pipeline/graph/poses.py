@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.bop.masks import decode_rle
 from pipeline.bop.symmetries import SYMMETRIES_VERSION, mesh_symmetries, transforms_of
 from pipeline.confidence.evidence import Extent, collect_evidence, measure_extent
 from pipeline.errors import NoPose
+from pipeline.functional.depth_fit import fit_depth
 from pipeline.functional.symmetry import make_canonical
 from pipeline.graph.bank import StoredBank
 from pipeline.graph.context import Context, ImageId
@@ -29,6 +31,7 @@ from pipeline.items.views import Detection, Target
 from pipeline.method import ONLINE_STAGES
 from pipeline.route import Route, trace_pose
 from pipeline.spec import digest
+from pipeline.stages.render.raycast import render_depth
 from pipeline.store import Ref, make_ref
 
 POSES_VERSION = 4
@@ -61,6 +64,8 @@ class PoseNodes:
         recipe |= {name: getattr(stages, name).recipe() for name in ONLINE_STAGES}
         if stages.second_look.hypotheses:  # renderer and extractor are in the keys of the templates and their features
             recipe["second look"] = stages.second_look.recipe()
+        if self._uses_depth:
+            recipe["depth"] = stages.depth.recipe()
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
             inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key
@@ -79,6 +84,8 @@ class PoseNodes:
             if stages.oracle:
                 asked += [self._truth(d).T_cam_obj.tolist() for _, d in self._detections(target)]
                 asked += [self.context.model(obj_id).symmetries.tolist()]
+            if self._uses_depth:
+                asked.append(self.context.dataset.depth_identity(*image))
             features = [self.queries.features(image, layer).key for layer in stages.layers]
             inputs[f"image {target.im_id}"] = digest([asked, self.queries.crops(image).key, features])
         return make_ref("poses", recipe, inputs)
@@ -196,6 +203,10 @@ class PoseNodes:
         else:
             raise best.failure or NoPose("solve", "no hypothesis")
         count = 0 if matches is None else len(matches.similarity)
+        notes = best.notes
+        if self._uses_depth:
+            T_cam_obj, note = self._fit_depth(T_cam_obj, d)
+            notes = (*notes, note)
         evidence, alternatives = self._evidence(trace, query, bank, d.obj_id)
         return PoseEstimate(
             scene_id=d.scene_id,
@@ -213,11 +224,36 @@ class PoseNodes:
             reprojection_px=best.solution.reprojection_px if best.solution else None,
             gt_id=d.gt_id,
             fallback=fallback,
-            notes=best.notes,
+            notes=notes,
             times_s={**shared_s, **trace.times_s},
             evidence=evidence,
             alternatives=tuple(replace(a, T_cam_obj=self._canonical(a.T_cam_obj, d.obj_id)) for a in alternatives),
         )
+
+    @property
+    def _uses_depth(self) -> bool:
+        """Whether poses are fitted to measured depth."""
+        use = self.context.stages.depth.use
+        return use == "always" or (use == "given" and self.context.dataset.gives_depth)
+
+    def _fit_depth(self, T_cam_obj: Float[np.ndarray, "4 4"], d: Detection) -> tuple[Float[np.ndarray, "4 4"], str]:
+        """The pose fitted to the depth image inside the detection, and a note that marks it."""
+        context, image = self.context, (d.scene_id, d.im_id)
+        depth_mm, K, model = context.dataset.depth_mm(*image), context.K(image), context.model(d.obj_id)
+        if d.rle is None:
+            x0, y0, x1, y1 = np.clip(np.rint(d.bbox_xyxy), 0, None).astype(int)
+            mask = np.zeros(depth_mm.shape, dtype=bool)
+            mask[y0 : y1 + 1, x0 : x1 + 1] = True
+        else:
+            mask = decode_rle(d.rle)
+
+        def render(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "H W"]:
+            return render_depth(model.mesh, K, T[None], depth_mm.shape)[0]
+
+        rounds = context.stages.depth.rounds
+        fitted = fit_depth(T_cam_obj, render, depth_mm, mask, K, model.diameter_mm, rounds=rounds)
+        moved_mm = float(np.linalg.norm(fitted[:3, 3] - T_cam_obj[:3, 3]))
+        return fitted, f"RGB-D: fitted to the depth image, translation moved by {moved_mm:.1f} mm"
 
     def _evidence(
         self, trace: Trace, query: Query, bank: StoredBank, obj_id: int

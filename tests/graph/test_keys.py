@@ -25,7 +25,7 @@ from pipeline.bop.images import image_digest
 from pipeline.bop.photo import PhotoConfig
 from pipeline.errors import BadInput
 from pipeline.io.digests import file_digest, track_files
-from pipeline.method import SecondLook, Stages
+from pipeline.method import DepthFit, SecondLook, Stages
 from pipeline.options import Evaluate, Select
 
 NAMES = sorted(f"{path.parent.name}/{path.stem}" for path in VARIANTS)
@@ -61,7 +61,9 @@ def photo(root: Path, **given: Any) -> TinyRun:
         mask=str(scene / "mask_visib" / "000000_000000.png"),
         K=K,
     )
-    return TinyRun(replace(config, **given).open, replace(BASE, detect=variant("detect/photo")))
+    return TinyRun(
+        replace(config, **given).open, replace(BASE, detect=variant("detect/photo"), depth=DepthFit(use="given"))
+    )
 
 
 def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
@@ -380,6 +382,8 @@ def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property
         "name": {"name": "other"},
         "mask_label": {"mask": write_labels(root / "labels.png"), "mask_label": 2},
         "image": {"image": str(root / SCENE / "rgb" / "000003.png")},
+        "depth": {"depth": str(root / SCENE / "depth" / "000000.png")},
+        "depth_scale": {"depth": str(root / SCENE / "depth" / "000000.png"), "depth_scale": 0.1},
     }
     for name, changed in changes.items():
         perturbations.change(name, photo(root, **(given | changed)))
