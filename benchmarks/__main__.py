@@ -21,6 +21,7 @@ from benchmarks.measure import Measurement, describe_machine, table
 from benchmarks.meshes import meshes
 from benchmarks.online import online
 from benchmarks.rendering import rendering
+from benchmarks.startup import startup
 from benchmarks.storing import storing
 from pipeline.io.files import write_json
 from pipeline.parallel import use_threads
@@ -32,6 +33,7 @@ PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "render": rendering,
     "extract": extraction,
     "jobs": warm,
+    "startup": startup,
     "onboard": onboarding,
     "memory": memory,
     "extract-sd": extraction_sd,

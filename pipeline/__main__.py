@@ -13,11 +13,13 @@ import signal
 if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
+import importlib
 import logging
 import os
 import sys
 import traceback
 import warnings
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from contextlib import nullcontext
 from pathlib import Path
@@ -30,37 +32,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from pipeline.cli.cache import cache_command
-from pipeline.cli.fetch import fetch_command
-from pipeline.cli.reproduce import reproduce_command
-from pipeline.cli.score import lint_command, score_command
-from pipeline.cli.sweep import SweepJobs, failures_text, record_failed_job, record_finished_job, same_answers_text
-from pipeline.cli.symmetry import symmetry_command
 from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
-from pipeline.configuration import (
-    CONF,
-    PACKAGE,
-    build_options,
-    build_stages,
-    build_variant,
-    check_fields,
-    suggest_field,
-    suggest_variant,
-)
 from pipeline.errors import BadInput, DzopError
-from pipeline.io.checkpoints import offline
 from pipeline.io.digests import track_files
-from pipeline.run import make_report, run
-from pipeline.store import Store
+from pipeline.places import CONF, PACKAGE
 
-COMMANDS = {
-    "cache": cache_command,
-    "fetch": fetch_command,
-    "lint": lint_command,
-    "reproduce": reproduce_command,
-    "score": score_command,
-    "symmetry": symmetry_command,
-}
+COMMANDS = ("cache", "fetch", "lint", "reproduce", "score", "symmetry")
+"""Commands beside a run; each is ``<name>_command`` of a module of pipeline/cli."""
 RESUME = "Completed entries are cached; rerun to resume."
 READERS = ("__main__.py", "configuration.py")  # our modules whose frames may lie between Hydra's
 NEEDED = {
@@ -86,7 +64,7 @@ def main() -> None:
         with stop_on_signals():
             if sys.argv[1:2] and sys.argv[1] in COMMANDS:
                 with track_files():
-                    COMMANDS[sys.argv[1]](sys.argv[2:])
+                    _load_command(sys.argv[1])(sys.argv[2:])
             else:
                 _run_jobs()
     except BrokenPipeError:  # the reader of a pipe, such as head, has closed it: not an error
@@ -99,6 +77,12 @@ def main() -> None:
         if message is None:
             raise
         sys.exit(message)
+
+
+def _load_command(name: str) -> Callable[[list[str]], None]:
+    """The function of a command. Its modules are imported now, so that ``--help`` does not wait for them."""
+    module = importlib.import_module(f"pipeline.cli.{'score' if name == 'lint' else name}")
+    return cast(Callable[[list[str]], None], getattr(module, f"{name}_command"))
 
 
 def _silence_resource_trackers() -> None:
@@ -133,10 +117,15 @@ def _raised_by_hydra(error: BaseException) -> bool:
 
 def _format_error(error: BaseException) -> str:
     """An error as one line, without the parts of Hydra's messages that do not help here."""
+    if isinstance(error, DzopError):
+        return "error: " + " ".join(str(error).split())
+    from pipeline.configuration import suggest_field, suggest_variant
+
     text = str(error).split("\nConfig search path")[0]
     if text.startswith("Could not override"):
         name = text.split("'")[1]
-        text = f"Could not override '{name}': found no such field, needs one that --help lists{suggest_field(name)}"
+        needed = f"needs one that dzop --cfg job lists{suggest_field(name)}"
+        text = f"Could not override '{name}': found no such field, {needed}"
     if "Could not find '" in text:
         name, _, listed = text.partition("Could not find '")[2].partition("'")
         group, _, variant = name.rpartition("/")
@@ -145,7 +134,7 @@ def _format_error(error: BaseException) -> str:
     if "hydra.cc" in text:  # a value that Hydra's grammar cannot parse
         text = text.split("See https")[0].strip()
         if "missing EQUAL" in text:
-            return f"error: found {text.split()[3]}, needs NAME=VALUE, such as step=report; dzop --help lists all names"
+            return f"error: found {text.split()[3]}, needs NAME=VALUE, such as step=report; dzop --help has examples"
         text = f"{text}: a value with special characters needs both kinds of quotes, as {QUOTING_EXAMPLE}"
     return "error: " + " ".join(text.split())
 
@@ -155,6 +144,8 @@ def _format_error(error: BaseException) -> str:
 
 def _run_jobs() -> None:
     """Run one job, or all jobs of a sweep. Exits with one line that names the jobs that failed."""
+    from pipeline.cli.sweep import SweepJobs, failures_text, same_answers_text
+
     jobs = SweepJobs.start()
     try:
         _hydra_main()
@@ -170,6 +161,8 @@ def _run_jobs() -> None:
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
 def _hydra_main(config: DictConfig) -> None:
     """Run one job. A sweep goes on after a job that fails, whatever the error."""
+    from pipeline.cli.sweep import record_finished_job
+
     sweeping = HydraConfig.get().mode is RunMode.MULTIRUN
     try:
         answers = _run_job(config, resume=sweeping)
@@ -194,6 +187,12 @@ def _hydra_main(config: DictConfig) -> None:
 
 def _run_job(config: DictConfig, *, resume: bool) -> str:
     """Run one job; returns the digest of its answers, "" for none."""
+    # These import torch and Zarr, which takes seconds: --help and a mistake on the command line come before.
+    from pipeline.configuration import build_options, build_stages, build_variant, check_fields
+    from pipeline.io.checkpoints import offline
+    from pipeline.run import make_report, run
+    from pipeline.store import Store
+
     # plain dicts: nothing below knows OmegaConf
     values = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     check_fields(values)
@@ -215,6 +214,8 @@ def _run_job(config: DictConfig, *, resume: bool) -> str:
 
 def _fail_job(config: DictConfig, error: DzopError) -> None:
     """Exit with an error. In a sweep, print and record it instead, so that the sweep goes on."""
+    from pipeline.cli.sweep import record_failed_job
+
     text = _format_error(error)
     if HydraConfig.get().mode is RunMode.RUN:
         sys.exit(text)

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, get_origin, get_type_hints
+from collections.abc import Mapping, Sequence
+from typing import Any, cast, get_origin, get_type_hints
 
+from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.utils import get_class
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic.dataclasses import is_pydantic_dataclass
 
 from pipeline.errors import BadInput
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.method import DepthFit, SecondLook, Stages
 from pipeline.options import Evaluate, Options, Select
+from pipeline.places import CONF
 from pipeline.spec import build, did_you_mean
 
-PACKAGE = Path(__file__).resolve().parent
-CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
 OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method", "confidence")
 REQUIRED = (*STAGES, *OPTIONS, "second_look", "depth", "fallback", "dataset", "store", "runtime", "select", "evaluate")
@@ -29,6 +30,17 @@ OWN_CLASS_WARNING = (
     "a class outside the package: cached results are found by its kind, version and fields, not by its code; "
     "raise its version after a change, or use store=memory"
 )
+
+
+def compose_settings(settings: Sequence[str]) -> dict[str, Any]:
+    """The configuration of a command line with these overrides, as plain values. Raises BadInput."""
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", overrides=list(settings))
+        return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except (HydraException, OmegaConfBaseException) as error:
+        found = " ".join(str(error).split())
+        raise BadInput("settings", found=found, needed="overrides as on the command line") from None
 
 
 def check_fields(values: Mapping[str, Any]) -> None:

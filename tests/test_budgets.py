@@ -140,7 +140,7 @@ def test_the_batch_size_follows_the_budget(monkeypatch):
 
 PEAK = """
 import sys
-import psutil, pipeline.__main__ as command, pipeline.stages.extract.hog
+import psutil, pipeline.__main__ as command, pipeline.run, pipeline.configuration, pipeline.stages.extract.hog
 from benchmarks.measure import peak_bytes
 room, *arguments = sys.argv[1:]
 budget = psutil.Process().memory_info().rss + int(room)

@@ -257,13 +257,13 @@ def test_ones_own_photograph_gives_a_pose_and_an_overlay(dzop, tmp_path, scene, 
         (("report",), "found 'report', needs NAME=VALUE, such as step=report"),
         (
             ("render.count.views=3",),
-            "found no such field, needs one that --help lists; render.count is a value and has no",
+            "found no such field, needs one that dzop --cfg job lists; render.count is a value and has no",
         ),
         (("store=s3",), "store.url: found nothing, needs s3://bucket/prefix"),
-        (("cluster.cuont=3",), "needs one that --help lists; did you mean count?"),
+        (("cluster.cuont=3",), "needs one that dzop --cfg job lists; did you mean count?"),
         (
             ("dataset.mask=a.png",),
-            "found no such field, needs one that --help lists; dataset=photo has it",
+            "found no such field, needs one that dzop --cfg job lists; dataset=photo has it",
         ),
         (
             ("+match.topk=3",),
@@ -460,10 +460,13 @@ def test_cache_commands_list_measure_verify_and_clean(dzop):
     assert '"recipe"' in dzop("cache", "path", key[:12]).out
 
 
-def test_help_names_the_commands_the_variants_and_the_fields(capsys, monkeypatch):
+def test_help_shows_examples_the_variants_and_where_the_rest_is(capsys, monkeypatch):
     shown = run_dzop(capsys, monkeypatch, "--help").out
-    for line in ("dzop cache --help", "match: cosine, masked_cosine, oracle, words", "gallery: 12"):
+    for line in ("dzop fetch, reproduce, cache", "match: cosine, masked_cosine, oracle, words", "--cfg job"):
         assert line in shown
+    examples = shown.split("Examples:")[1].split("Other commands")[0]
+    assert len([line for line in examples.splitlines() if line.startswith("  dzop")]) == 5
+    assert "gallery: 12" in run_dzop(capsys, monkeypatch, "--cfg", "job").out
 
 
 @pytest.mark.parametrize(

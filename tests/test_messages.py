@@ -117,7 +117,7 @@ def test_a_suspicious_mask_is_warned_about_and_recorded(photo, tmp_path, mask, m
     Image.fromarray(mask).save("mask.png")
     ran = photo("dataset.mask=mask.png")
     assert "Traceback" not in ran.err
-    assert f"warning: scene 0, image 0, object 1: {message}" in ran.out
+    assert f"warning: 000000.png, obj_000001: {message}" in ran.out
     record = json.loads(next(tmp_path.glob("results/*/*/poses.json")).read_text())
     (warning,) = record["warnings"]
     assert message in warning
@@ -219,7 +219,10 @@ def test_step_detect_prints_the_warnings_of_file_and_detections(dzop, entries, m
     ("given", "message"),
     [
         ("dataset.bbox=[1,2,3]", "error: dataset.bbox: found 3 numbers, needs 4: [x,y,width,height]"),
-        ("dataset.msk=a", "error: Could not override 'dataset.msk': found no such field, needs one that --help lists"),
+        (
+            "dataset.msk=a",
+            "error: Could not override 'dataset.msk': found no such field, needs one that dzop --cfg job lists",
+        ),
         (
             "dataset.mask=my(mask.png",
             """'my(mask.png': a value with special characters needs both kinds of quotes, as 'dataset.image=""",

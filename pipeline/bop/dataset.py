@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.bop.images import image_digest, image_size, read_depth, read_mask, read_rgb
+from pipeline.bop.images import image_digest, image_size, read_depth, read_mask, read_orientation, read_rgb
 from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
 from pipeline.bop.layout import check_folders, check_scene_folder, check_sensor_name, find_model
 from pipeline.bop.lens import describe_distortion
@@ -126,6 +126,14 @@ class Dataset:
         """What was done to the images beyond reading them; pictures say it."""
         return ""
 
+    def image_name(self, scene_id: int, im_id: int) -> str:
+        """What messages call an image."""
+        return f"scene {scene_id}, image {im_id}"
+
+    def object_name(self, obj_id: int) -> str:
+        """What messages call an object."""
+        return f"object {obj_id}"
+
     def scene(self, scene_id: int) -> Scene:
         """The scene; its JSON files are read once."""
         if scene_id not in self._scenes:
@@ -152,6 +160,10 @@ class Dataset:
     def image_size(self, scene_id: int, im_id: int) -> tuple[int, int]:
         """(h, w) of the image, from its header."""
         return image_size(self.image_path(scene_id, im_id))
+
+    def orientation(self, scene_id: int, im_id: int) -> int:
+        """EXIF orientation of the image's file, 1 for an upright one."""
+        return read_orientation(self.image_path(scene_id, im_id))
 
     def image_width(self, scene_id: int, im_id: int) -> int:
         """Width of the image, px: of its file, its depth image, camera*.json, or BOP's known width, in this order.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,7 +9,16 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.bop.dataset import Dataset
+from pipeline.bop.given import (
+    GivenObjects,
+    MeshFiles,
+    check_box,
+    check_box_in_image,
+    check_own_camera,
+    detect_box,
+    detect_mask,
+    parse_K,
+)
 from pipeline.bop.images import (
     QUARTER_TURNS,
     image_digest,
@@ -20,18 +28,13 @@ from pipeline.bop.images import (
     read_orientation,
     read_rgb,
 )
-from pipeline.bop.jsonio import is_number
 from pipeline.bop.lens import Lens, parse_lens
-from pipeline.bop.scene import Box, check_K, xyxy_from_xywh
+from pipeline.bop.scene import Box, xyxy_from_xywh
 from pipeline.errors import BadInput
-from pipeline.functional.camera_diagnosis import denormalize_camera
-from pipeline.io.meshes import prepare_mesh, prepared_digest
-from pipeline.items.objects import ObjectModel
-from pipeline.items.views import Image, Target
+from pipeline.items.views import Detection, Image, Target
 from pipeline.spec import FaceCount, Positive, PositiveFloat, Spec, digest, spec
 
 SCENE_ID, IM_ID = 0, 0
-_MIN_DIAMETER_MM = 2.0
 
 
 @spec
@@ -66,12 +69,8 @@ class PhotoConfig(Spec):
         """The dataset, checked. Raises BadInput."""
         image = Path(self.image).expanduser()
         size_hw = image_size(image)
-        K = self._matrix()
-        if pixels := denormalize_camera(K, size_hw):
-            found, fitting = f"{list(self.K)}, divided by the image's size", ",".join(f"{v:.6g}" for v in pixels)
-            raise BadInput("dataset.K", found=found, needed=f"pixels: 'dataset.K=[{fitting}]'")
-        check_K(K, size_hw, "dataset.K")
-        _check_principal_point(K, size_hw)
+        K = parse_K(self.K, "dataset.K")
+        check_own_camera(K, size_hw, "dataset.K")
         if self.mask is not None and self.bbox is not None:
             raise BadInput("dataset", found="mask and bbox", needed="only one of them")
         meshes = (self.mesh,) if isinstance(self.mesh, str) else self.mesh
@@ -81,7 +80,7 @@ class PhotoConfig(Spec):
                 "dataset.mesh", found=found, needed="one mesh, or several without dataset.mask and dataset.bbox"
             )
         if self.bbox is not None:
-            _check_box(self.bbox)
+            check_box(self.bbox, "dataset.bbox")
         if self.depth is not None:
             self._check_depth(Path(self.depth).expanduser(), size_hw)
         return Photo(
@@ -92,12 +91,11 @@ class PhotoConfig(Spec):
             models_info={},
             targets=tuple(Target(SCENE_ID, IM_ID, obj_id) for obj_id in range(1, len(meshes) + 1)),
             photo_path=image,
-            mesh_paths=tuple(Path(mesh).expanduser() for mesh in meshes),
+            meshes=MeshFiles(tuple(Path(mesh).expanduser() for mesh in meshes), self.scale, self.simplify),
             camera_matrix=K,
             mask_label=self.mask_label,
             mask_file=None if self.mask is None else Path(self.mask).expanduser(),
             bbox_xyxy=None if self.bbox is None else xyxy_from_xywh(self.bbox),
-            scale=self.scale,
             lens=None if self.distortion is None else parse_lens(self.distortion, K, size_hw),
             simplify=self.simplify,
             depth_file=None if self.depth is None else Path(self.depth).expanduser(),
@@ -113,53 +111,16 @@ class PhotoConfig(Spec):
         if self.distortion is not None:
             raise BadInput("dataset.depth", found="with dataset.distortion", needed="an undistorted pair of images")
 
-    def _matrix(self) -> Float[np.ndarray, "3 3"]:
-        flat = [value for row in self.K for value in (row if isinstance(row, tuple) else (row,))]
-        if not all(is_number(value) for value in flat):
-            raise BadInput("dataset.K", found=list(self.K), needed="numbers: [fx,fy,cx,cy] or the matrix, row by row")
-        if len(flat) == 4:
-            fx, fy, cx, cy = flat
-            return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        if len(flat) == 9:
-            return np.array(flat, float).reshape(3, 3)
-        raise BadInput(
-            "dataset.K", found=f"{len(flat)} numbers", needed="[fx,fy,cx,cy] or the 9 of the matrix, row by row"
-        )
-
-
-def _check_box(bbox_xywh: Sequence[float]) -> None:
-    """Raise BadInput for a box that is not four finite numbers with an area."""
-    if len(bbox_xywh) != 4:
-        raise BadInput("dataset.bbox", found=f"{len(bbox_xywh)} numbers", needed="4: [x,y,width,height]")
-    if not np.isfinite(bbox_xywh).all():
-        raise BadInput("dataset.bbox", found=list(bbox_xywh), needed="four finite numbers: [x,y,width,height]")
-    if min(bbox_xywh[2:]) <= 0:
-        found = f"{list(bbox_xywh)}, which has no area"
-        raise BadInput("dataset.bbox", found=found, needed="[x,y,width,height] with width and height above 0")
-
-
-def _check_principal_point(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> None:
-    """Raise BadInput for a principal point far outside the image: K probably belongs to another image size.
-
-    Without annotations nothing else can reveal this.
-    """
-    (h, w), (cx, cy) = size_hw, K[:2, 2]
-    if not (-w <= cx <= 2 * w and -h <= cy <= 2 * h):
-        found = f"principal point ({cx:g}, {cy:g}) for an image of {w} x {h} (width x height)"
-        raise BadInput("dataset.K", found=found, needed="the K of this image at this size")
-
 
 @dataclass(frozen=True, eq=False)
-class Photo(Dataset):
+class Photo(GivenObjects):
     """A dataset of one image, without ground truth."""
 
     photo_path: Path = Path()
-    mesh_paths: tuple[Path, ...] = ()
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     mask_file: Path | None = None
     mask_label: int | None = None
     bbox_xyxy: Box | None = None
-    scale: float = 1.0
     lens: Lens | None = None
     depth_file: Path | None = None
     depth_scale: float = 1.0
@@ -200,16 +161,6 @@ class Photo(Dataset):
         return given if self.lens is None else [*given, self.lens.identity()]
 
     @property
-    def requires_pose(self) -> bool:
-        """True: who gives a photograph wants its pose."""
-        return True
-
-    @property
-    def finds_symmetries(self) -> bool:
-        """True: own meshes have no models_info.json."""
-        return True
-
-    @property
     def image_note(self) -> str:
         """That pictures show the photograph without distortion."""
         return "" if self.lens is None else "undistorted photograph"
@@ -234,6 +185,10 @@ class Photo(Dataset):
             raise BadInput(path, found=found, needed=f"those of the photograph, {w} x {h} (width x height){cause}")
         return mask if self.lens is None else self.lens.undistort(mask)
 
+    def image_name(self, scene_id: int, im_id: int) -> str:
+        """Name of the photograph's file."""
+        return self.photo_path.name
+
     def image_path(self, scene_id: int, im_id: int) -> Path:
         """The photograph's file."""
         return self.photo_path
@@ -242,27 +197,19 @@ class Photo(Dataset):
         """The photograph's camera matrix, px."""
         return self.camera_matrix
 
-    def distortion(self, scene_id: int, im_id: int) -> str:
-        """Nothing: coefficients that are given are applied."""
-        return ""
+    @property
+    def location_files(self) -> list[Path]:
+        """The photograph, and its mask file if given."""
+        return [self.photo_path] + ([] if self.mask_file is None else [self.mask_file])
 
-    def has_ground_truth(self, scene_id: int) -> bool:
-        """False: a photograph has no ground truth."""
-        return False
-
-    def model_path(self, obj_id: int, *, folder: str | None = None) -> Path:
-        """An object's mesh file."""
-        return self.mesh_paths[obj_id - 1]
-
-    def mesh_digest(self, obj_id: int) -> str:
-        """Digest of an object's mesh, scaled and simplified."""
-        return prepared_digest(self.model_path(obj_id), scale=self.scale, simplify=self.simplify)
-
-    def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
-        """An object with its mesh scaled and simplified. Raises BadInput for a mesh too small to be in millimetres."""
-        path = self.model_path(obj_id)
-        mesh, facts = prepare_mesh(path, scale=self.scale, simplify=self.simplify)
-        if facts.diameter_mm < _MIN_DIAMETER_MM:
-            found = f"a mesh of diameter {facts.diameter_mm:.3g} (it looks like metres)"
-            raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
-        return ObjectModel(obj_id, mesh, facts.diameter_mm, facts=facts)
+    def locate(self, target: Target) -> list[Detection]:
+        """The detection of the mask or box. Raises BadInput for one that does not fit the photograph, and for none."""
+        if self.mask_file is None and self.bbox_xyxy is None:
+            needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=cnos, which finds the object"
+            raise BadInput("dataset", found="neither of mask and bbox", needed=needed)
+        size_hw = self.image_size(target.scene_id, target.im_id)
+        if self.mask_file is not None:
+            return [detect_mask(target, self.object_mask(self.mask_file, size_hw), self.mask_file)]
+        box = self.bbox_xyxy or (0.0,) * 4
+        check_box_in_image(box, size_hw, "dataset.bbox")
+        return [detect_box(target, box if self.lens is None else self.lens.undistort_box(box, "dataset.bbox"))]

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.io.files import write_atomic
-from pipeline.outputs.records import write_failure_record
 
 FOLDER_VARIABLE = "DZOP_SWEEP_JOBS"
 """Environment variable through which jobs in other processes learn the folder to write their outcome to."""
@@ -57,6 +56,8 @@ class SweepJobs:
 
 def record_failed_job(config: Mapping[str, Any], number: int, overrides: Sequence[str], message: str) -> None:
     """Record that a job failed: for the last line of its sweep, and for reports."""
+    from pipeline.outputs.records import write_failure_record  # slow to import, and most jobs succeed
+
     _record_job(number, "failed", overrides, message)
     values = {name: _to_json(value) for name, value in config.items()}
     write_failure_record(values.get("out", "results"), values, overrides, message)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bop.images import read_orientation
 from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import diagnose_camera
@@ -75,12 +74,13 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
-            warnings.append(f"scene {scene_id}, image {im_id}: {problem}")
+            warnings.append(f"{context.dataset.image_name(scene_id, im_id)}: {problem}")
         if reason := context.dataset.distortion(scene_id, im_id):
-            warnings.append(f"scene {scene_id}, image {im_id}: {reason}")
+            warnings.append(f"{context.dataset.image_name(scene_id, im_id)}: {reason}")
     for d in detections:
         if d.defect is None and (problem := _check_detection(context, d)):
-            warnings.append(f"scene {d.scene_id}, image {d.im_id}, object {d.obj_id}: {problem}")
+            image, name = context.dataset.image_name(d.scene_id, d.im_id), context.dataset.object_name(d.obj_id)
+            warnings.append(f"{image}, {name}: {problem}")
     return warnings
 
 
@@ -94,7 +94,8 @@ def mesh_warnings(context: Context, facts_of: Callable[[int], MeshFacts]) -> lis
             warnings.append(warning)
         for text in (*facts.warnings, *_check_diameter(facts), *_check_size(facts, context.dataset.simplify)):
             objects.setdefault(text, []).append(obj_id)
-    return warnings + [f"{_describe_objects(obj_ids)}: {text}" for text, obj_ids in objects.items()]
+    names = context.dataset.object_name
+    return warnings + [f"{_describe_meshes([*map(names, obj_ids)])}: {text}" for text, obj_ids in objects.items()]
 
 
 def _check_diameter(facts: MeshFacts) -> tuple[str, ...]:
@@ -114,13 +115,16 @@ def _check_size(facts: MeshFacts, simplify: int | None) -> tuple[str, ...]:
     return (f"it has {millions:.1f} million faces: {cost}; dataset.simplify=200000 renders a smaller one",)
 
 
-def _describe_objects(obj_ids: Sequence[int]) -> str:
-    shown = ", ".join(map(str, obj_ids[:MAX_IDS])) + (", ..." if len(obj_ids) > MAX_IDS else "")
-    return f"mesh of object{'s' if len(obj_ids) > 1 else ''} {shown}"
+def _describe_meshes(names: Sequence[str]) -> str:
+    """``mesh of object 1, 5``, or by the names that a user gave."""
+    numbered = all(name.startswith("object ") for name in names)
+    shown = [name.removeprefix("object ") if numbered else name for name in names[:MAX_IDS]]
+    of = ("object" if len(names) == 1 else "objects") + " " if numbered else ""
+    return f"mesh of {of}{', '.join(shown)}" + (", ..." if len(names) > MAX_IDS else "")
 
 
 def _check_camera(context: Context, image: ImageId) -> str:
-    orientation = read_orientation(context.dataset.image_path(*image))
+    orientation = context.dataset.orientation(*image)
     return diagnose_camera(context.K(image), context.dataset.image_size(*image), exif_orientation=orientation)
 
 

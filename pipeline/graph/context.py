@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
@@ -114,6 +114,13 @@ class Context:
     def tensor(self, values: np.ndarray) -> torch.Tensor:
         """Copy an array to the device."""
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    def with_images(self, dataset: Dataset, store: Store) -> Context:
+        """The context of other images of the same objects, with the weights and meshes that this one has in memory."""
+        other = replace(self, dataset=dataset, targets=dataset.targets, store=store, progress=Progress(False))
+        vars(other).update({name: getattr(self, name) for name in ("backbone", "models", "device")})
+        other._mesh_digests.update(self._mesh_digests)
+        return other
 
     # --- tasks -------------------------------------------------------------------------------------------------------
 

@@ -30,11 +30,11 @@ from pipeline.scoring import Scorer
 
 
 class Graph:
-    """All nodes of one run."""
+    """All nodes of one run. ``templates``: those of another graph with the same stages and objects, kept in memory."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, templates: TemplateNodes | None = None) -> None:
         self.context = context
-        self.templates = TemplateNodes(context)
+        self.templates = templates or TemplateNodes(context)
         self.detections = DetectionNodes(context, proposal_nodes(context))
         self.queries = QueryNodes(context, self.detections)
         self.poses = PoseNodes(context, self.templates, self.queries)

@@ -150,7 +150,7 @@ class PoseNodes:
         document = {"answers": [answer_to_record(answer) for answer in answers]}
         self.context.store.put_document(ref, document, rows=len(answers), time_s=seconds)
         self.context.progress.add("poses", computed=len(answers), time_s=seconds)
-        templates = self.context.store.read(self.templates.templates(obj_id)).rows
+        templates = self.templates.context.store.read(self.templates.templates(obj_id)).rows
         work = timing_key("poses", self.context.stages, rows=templates)
         self.context.timings.add(work, len(self.groups[group]), time.perf_counter() - began)
 

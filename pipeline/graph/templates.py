@@ -39,11 +39,13 @@ RERENDER_SCALE = 2  # side of a rerendered view relative to its crop
 class TemplateNodes:
     """Nodes of objects. Methods named by a noun return references to entries; ``make_*`` compute missing entries.
 
-    ``views``: number of full template views that a bank keeps in memory.
+    ``views``: number of full template views that a bank keeps in memory. ``banks``: number of objects whose templates
+    are kept in memory.
     """
 
     context: Context
     views: int = 64
+    banks: int = 1
 
     @cached_property
     def templates(self) -> Callable[[int], Ref]:
@@ -274,8 +276,8 @@ class TemplateNodes:
 
     @cached_property
     def bank(self) -> Callable[[int], StoredBank]:
-        """An object's templates for the online route; those of the last object stay in memory."""
-        return lru_cache(maxsize=1)(self._bank)
+        """An object's templates for the online route; those of the last ``banks`` objects stay in memory."""
+        return lru_cache(maxsize=self.banks)(self._bank)
 
     def _bank(self, obj_id: int) -> StoredBank:
         features, crops, templates = self._open(obj_id)

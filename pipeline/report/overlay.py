@@ -24,17 +24,22 @@ Line = Float[np.ndarray, "_m 2"]
 _NEAR_MM = 10.0  # edges are clipped where they come closer to the camera plane
 _FAR_PX = 1e6  # fixed-point drawing coordinates overflow beyond this
 _SUBPIXEL_BITS = 4
+AXIS_COLOURS: tuple[Colour, ...] = ((235, 60, 60), (70, 200, 80), (70, 120, 255))
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]  # corners differ in one axis
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnPose:
-    """One pose to draw. ``role`` "unchecked": an estimate without ground truth to compare with."""
+    """One pose to draw. ``role`` "unchecked": an estimate without ground truth to compare with.
+
+    ``axes``: also draw the axes of the object frame from its origin, x red, y green, z blue.
+    """
 
     mesh: Mesh
     T_cam_obj: Float[np.ndarray, "4 4"]
     role: Role
     label: str = ""
+    axes: bool = False
 
 
 def draw_overlay(
@@ -60,6 +65,9 @@ def draw_overlay(
     for item in ordered:
         thickness = width + 1 if item.role == "truth" else width
         _draw_lines(canvas, _outlines(item, K, (h, w)), ROLE_COLOURS[item.role], thickness)
+    for item in ordered:
+        for colour, segment in _axes(item, K):
+            _draw_lines(canvas, [segment], colour, width + 1)
     roles = [role for role in ROLE_COLOURS if any(item.role == role for item in ordered)]
     return write_labels(canvas, _labels(ordered, K), roles if legend else [], note)
 
@@ -109,6 +117,18 @@ def _corners(mesh: Mesh) -> Float[np.ndarray, "8 3"]:
 def _box_segments(item: DrawnPose, K: Float[np.ndarray, "3 3"]) -> list[Float[np.ndarray, "2 2"]]:
     corners = transform(item.T_cam_obj, _corners(item.mesh))
     return list(project(K, clip_to_front(corners[np.array(_EDGES)])))
+
+
+def _axes(item: DrawnPose, K: Float[np.ndarray, "3 3"]) -> list[tuple[Colour, Line]]:
+    """Colour and segment of each axis of the object frame, as long as 0.6 times the mesh's bounding box is wide."""
+    if not item.axes:
+        return []
+    length_mm = 0.6 * float(np.ptp(item.mesh.vertices, axis=0).max())
+    lines = []
+    for colour, end in zip(AXIS_COLOURS, length_mm * np.eye(3), strict=True):
+        segment = clip_to_front(transform(item.T_cam_obj, np.stack([np.zeros(3), end]))[None])
+        lines += [(colour, project(K, part)) for part in segment]
+    return lines
 
 
 def _labels(items: Sequence[DrawnPose], K: Float[np.ndarray, "3 3"]) -> list[tuple[str, tuple[float, float], Role]]:

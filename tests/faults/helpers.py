@@ -29,7 +29,8 @@ CNOS = (
 )  # fmt: skip
 KINDS = ("templates", "crops", "features", "fitted", "proposals", "detections", "poses", "runs", "scores")
 MEASURED = ("time_s", "times_s")
-LOADED = ["pipeline.__main__", "pipeline.stages.detect.proposals.sam", "transformers.models.sam.modeling_sam"]
+LOADED = ["pipeline.__main__", "pipeline.run", "pipeline.cli.cache", "transformers.models.sam.modeling_sam"]
+LOADED += ["pipeline.stages.detect.proposals.sam"]
 LOADED += ["pipeline.stages.render.raycast", "trimesh", "scipy.spatial", "sklearn.cluster", "pipeline.report.gallery"]
 
 

@@ -1,0 +1,112 @@
+"""An image in memory, its camera, and masks or boxes of objects in it -> a dataset of one image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.bop.given import GivenObjects, check_box, check_box_in_image, detect_box, detect_mask
+from pipeline.bop.pixels import select_object
+from pipeline.bop.scene import Box, xyxy_from_xywh
+from pipeline.errors import BadInput
+from pipeline.items.views import Detection, Image, Target
+from pipeline.spec import digest
+
+Location = Bool[np.ndarray, "H W"] | Box
+"""A mask, or a box (x0, y0, x1, y1)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(GivenObjects):
+    """A dataset of one image in memory. ``locations``: by obj_id, one mask or box for every instance."""
+
+    rgb: UInt8[np.ndarray, "H W 3"] = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
+    camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    locations: Mapping[int, Sequence[Location]] = field(default_factory=dict)
+
+    def image(self, scene_id: int, im_id: int) -> Image:
+        """The image."""
+        return Image(scene_id, im_id, self.rgb, self.camera_matrix)
+
+    def image_digest(self, scene_id: int, im_id: int) -> str:
+        """Digest of the pixels."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
+        return digest([list(self.rgb.shape), sha256(np.ascontiguousarray(self.rgb).data).hexdigest()])
+
+    def image_size(self, scene_id: int, im_id: int) -> tuple[int, int]:
+        """(h, w) of the image."""
+        h, w = self.rgb.shape[:2]
+        return h, w
+
+    def image_name(self, scene_id: int, im_id: int) -> str:
+        """There is only one."""
+        return "image"
+
+    def orientation(self, scene_id: int, im_id: int) -> int:
+        """1: an array is as it is."""
+        return 1
+
+    def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
+        """The camera matrix, px."""
+        return self.camera_matrix
+
+    @property
+    def given_location(self) -> list[Any]:
+        """Digests of the masks and boxes: there are no files whose digests tell them apart."""
+        masks_and_boxes = [[obj_id, *map(_identify, given)] for obj_id, given in sorted(self.locations.items())]
+        return [digest(masks_and_boxes)]
+
+    def locate(self, target: Target) -> list[Detection]:
+        """A detection for every mask and box of the object, with score 1."""
+        given = self.locations[target.obj_id]
+        return [detect_box(target, at) if isinstance(at, tuple) else detect_mask(target, at, "mask") for at in given]
+
+
+def parse_image(rgb: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
+    """An image as h x w x 3 values of 8 bits; a grey one gets three equal channels. Raises BadInput."""
+    image = np.asarray(rgb)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise BadInput("rgb", found=f"{image.dtype} of shape {image.shape}", needed="uint8 of shape (h, w, 3), in rgb")
+    return np.repeat(image[..., None], 3, axis=-1) if image.ndim == 2 else image
+
+
+def parse_locations(given: Any, size_hw: tuple[int, int]) -> tuple[Location, ...]:
+    """Masks and boxes of the instances of an object, from one mask, one box [x,y,width,height], or a list of them.
+
+    Raises BadInput for anything else and for what does not fit the image.
+    """
+    if isinstance(given, (list, tuple)) and given and np.ndim(given[0]) > 0:
+        return tuple(_parse_location(one, size_hw, f" of instance {n}") for n, one in enumerate(given))
+    return (_parse_location(given, size_hw, ""),)
+
+
+def _parse_location(given: Any, size_hw: tuple[int, int], instance: str) -> Location:
+    values = np.asarray(given)
+    if values.ndim == 1:
+        numbers, where = [float(value) for value in values], f"bbox{instance}"
+        check_box(numbers, where)
+        box = xyxy_from_xywh(numbers)
+        check_box_in_image(box, size_hw, where)
+        return box
+    where = f"mask{instance}"
+    if values.shape[:2] != size_hw:
+        needed = f"that of the image, {size_hw[0]} x {size_hw[1]} (rows x columns), or a box [x,y,width,height]"
+        raise BadInput(where, found=f"shape {values.shape}", needed=needed)
+    mask = values if values.dtype == bool else select_object(values, Path(where))
+    if not mask.any():
+        raise BadInput(where, found="an empty mask", needed="the object's pixels not 0")
+    return mask
+
+
+def _identify(location: Location) -> list[float] | str:
+    return list(location) if isinstance(location, tuple) else sha256(np.packbits(location).data).hexdigest()

@@ -1,0 +1,166 @@
+"""The Python API: meshes once, then poses of images in memory.
+
+from pipeline import PoseEstimator
+
+estimator = PoseEstimator.from_mesh("mug.ply")
+result = estimator(rgb, K, mask=mask)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from threading import RLock
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from pipeline.bop.frame import Frame, parse_image, parse_locations
+from pipeline.bop.given import MeshFiles, check_own_camera, parse_K
+from pipeline.configuration import build_options, build_stages, build_variant, compose_settings
+from pipeline.errors import BadInput
+from pipeline.graph import Context, Graph
+from pipeline.io.digests import DigestCache, track_files
+from pipeline.items.views import Target
+from pipeline.outputs.pose_result import PoseResult, result_of
+from pipeline.parallel import use_threads
+from pipeline.progress import Progress
+from pipeline.store import MemoryStoreConfig, Store
+
+Mesh = str | PathLike[str]
+SCENE_ID, IM_ID = 0, 0
+MAX_BANKS = 8  # objects whose templates stay in memory
+PLACEHOLDERS = ("dataset=photo", "dataset.mesh=mesh", "dataset.image=image", "dataset.K=[1,1,1,1]")
+
+
+class PoseEstimator:
+    """Estimates poses of one or several objects, whose templates are rendered once and cached.
+
+    The templates are those of ``dzop dataset=photo``, in the same cache, and a pose is the same to the last digit.
+    Calls may come from any thread; one is computed at a time. An estimator is a context manager; ``close`` frees its
+    memory. All errors are ``pipeline.errors.DzopError``, with one line that says what was found and what is needed.
+    """
+
+    def __init__(self, meshes: Mapping[str, Mesh], *, settings: Sequence[str] = (), cache: Mesh | None = None) -> None:
+        """As ``from_mesh`` with several meshes."""
+        if not meshes:
+            raise BadInput("meshes", found="none", needed="at least one mesh")
+        self.names = tuple(meshes)
+        self._lock, self._open = RLock(), ExitStack()
+        with self._open as opening:
+            self._graph = self._onboard([Path(path).expanduser() for path in meshes.values()], settings, cache)
+            self._open = opening.pop_all()
+
+    @classmethod
+    def from_mesh(
+        cls, mesh: Mesh | Mapping[str, Mesh], *, settings: Sequence[str] = (), cache: Mesh | None = None
+    ) -> PoseEstimator:
+        """An estimator for a mesh file in millimetres, or for several by name; renders templates that are missing.
+
+        ``settings``: as on the command line, such as ``["method=zs6d", "dataset.scale=1000"]``. ``cache``: folder of
+        the templates, ``cache`` in the current folder by default. Raises DzopError.
+        """
+        meshes = mesh if isinstance(mesh, Mapping) else {Path(mesh).stem: mesh}
+        return cls(meshes, settings=settings, cache=cache)
+
+    def __call__(
+        self,
+        rgb: np.ndarray,
+        K: Any,
+        *,
+        mask: np.ndarray | None = None,
+        bbox: Sequence[float] | None = None,
+        name: str | None = None,
+    ) -> PoseResult:
+        """The pose of one object in an image.
+
+        ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. ``mask``: h x w, not 0 on
+        the object; or ``bbox``: x, y, width, height. ``name``: the object's, if the estimator has several.
+        """
+        if (mask is None) == (bbox is None):
+            found = "neither" if mask is None else "both"
+            raise BadInput("mask, bbox", found=found, needed="one of them, which says where the object is")
+        if name is None and len(self.names) > 1:
+            raise BadInput("name", found="nothing", needed=f"one of {', '.join(self.names)}")
+        given = bbox if mask is None else np.asarray(mask)
+        return self.find(rgb, K, {self.names[0] if name is None else name: given})[0]
+
+    def find(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> tuple[PoseResult, ...]:
+        """The poses of several objects or instances in one image, in the order given.
+
+        ``locations``: by name, a mask, a box [x, y, width, height], or a list of them for several instances.
+        """
+        frame = self._frame(parse_image(rgb), K, locations)
+        with self._lock:
+            return self._estimate(frame, list(locations))
+
+    def close(self) -> None:
+        """Free the templates and the model; the cache on disk stays."""
+        with self._lock:
+            self._open.close()
+            del self._graph
+
+    def __enter__(self) -> PoseEstimator:
+        """The estimator."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close the estimator."""
+        self.close()
+
+    def _onboard(self, paths: Sequence[Path], settings: Sequence[str], cache: Mesh | None) -> Graph:
+        """The graph of the meshes, with all templates made."""
+        values = compose_settings([*PLACEHOLDERS, *settings])
+        if cache is not None:
+            values["store"]["root"] = str(cache)
+        options, runtime = build_options(values), build_variant(values["runtime"], "runtime")
+        use_threads(options.threads)
+        store = Store(build_variant(values["store"], "store"))
+        folder = store.backend.folder
+        with track_files(None if folder is None else DigestCache(folder / ".digests")):
+            stages, photo = build_stages(values), build_variant(values["dataset"], "dataset")
+            meshes = MeshFiles(tuple(paths), photo.scale, photo.simplify, self.names)
+            dataset = _make_frame(meshes, tuple(Target(SCENE_ID, IM_ID, n + 1) for n in range(len(paths))))
+            context = Context(stages, dataset, dataset.targets, store, runtime, Progress(runtime.progress))
+            self._open.enter_context(store.in_use())
+            graph = Graph(context)
+            graph.templates.banks = min(len(paths), MAX_BANKS)
+            graph.check()
+            graph.limit_vram()
+            graph.onboard()
+            _ = context.backbone
+        return graph
+
+    def _frame(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> Frame:
+        unknown = [name for name in locations if name not in self.names]
+        if unknown or not locations:
+            found = repr(unknown[0]) if unknown else "no object"
+            raise BadInput("name", found=found, needed=f"one of {', '.join(self.names)}")
+        size_hw = (rgb.shape[0], rgb.shape[1])
+        camera_matrix = parse_K(np.asarray(K, dtype=np.float64).tolist(), "K")
+        check_own_camera(camera_matrix, size_hw, "K")
+        located = {self.names.index(name) + 1: parse_locations(given, size_hw) for name, given in locations.items()}
+        targets = tuple(Target(SCENE_ID, IM_ID, obj_id, len(at)) for obj_id, at in sorted(located.items()))
+        dataset = self._graph.context.dataset
+        assert isinstance(dataset, Frame)
+        return replace(dataset, targets=targets, rgb=rgb, camera_matrix=camera_matrix, locations=located)
+
+    def _estimate(self, frame: Frame, names: Sequence[str]) -> tuple[PoseResult, ...]:
+        context = self._graph.context.with_images(frame, Store(MemoryStoreConfig()))
+        graph = Graph(context, self._graph.templates)
+        warnings, image = graph.warnings(), frame.image(SCENE_ID, IM_ID)
+        results: dict[str, list[PoseResult]] = {name: [] for name in names}
+        for answer in graph.poses.estimate():
+            name, model = self.names[answer.obj_id - 1], context.model(answer.obj_id)
+            results[name].append(result_of(answer, name, image=image, model=model, warnings=warnings))
+        return tuple(result for name in names for result in results[name])
+
+
+def _make_frame(meshes: MeshFiles, targets: tuple[Target, ...]) -> Frame:
+    return Frame("frame", Path(), "test", "", {}, targets, meshes=meshes, simplify=meshes.simplify)

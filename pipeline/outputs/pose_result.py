@@ -1,0 +1,117 @@
+"""An answer of the route -> the result that a user gets: a pose with what is known of it, or a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from pipeline.items.objects import ObjectModel
+from pipeline.items.poses import Alternative, NoEstimate
+from pipeline.items.records import Answer
+from pipeline.items.views import Image
+from pipeline.report.overlay import DrawnPose, draw_overlay
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResult:
+    """The pose of one object in one image, or the reason why there is none.
+
+    ``T_cam_obj``: 4 x 4, object to camera coordinates, mm; camera axes x right, y down, z forward (OpenCV). None
+    without a pose; ``stage`` and ``reason`` then say what failed. ``score`` ranks estimates. ``confidence``: the
+    probability that the pose is right, and ``decision`` what to do with it (accept, check or reject); None where no
+    calibration exists. ``alternatives``: other poses that were found, best first. ``warnings``: what is suspicious
+    about mesh, camera, mask or box. ``correspondences``: point matches, of which ``inliers`` agree with the pose.
+    ``times_s``: seconds by stage.
+    """
+
+    name: str
+    T_cam_obj: Float[np.ndarray, "4 4"] | None
+    score: float | None = None
+    confidence: float | None = None
+    decision: str | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    stage: str | None = None
+    reason: str | None = None
+    warnings: tuple[str, ...] = ()
+    inliers: int = 0
+    correspondences: int = 0
+    reprojection_px: float | None = None
+    times_s: Mapping[str, float] = field(default_factory=dict)
+    image: Image | None = field(default=None, repr=False)
+    model: ObjectModel | None = field(default=None, repr=False)
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pose."""
+        return self.T_cam_obj is not None
+
+    @property
+    def quaternion_xyzw(self) -> Float[np.ndarray, " 4"] | None:
+        """The pose's rotation as a unit quaternion x, y, z, w with w >= 0; None without a pose."""
+        if self.T_cam_obj is None:
+            return None
+        return np.asarray(Rotation.from_matrix(self.T_cam_obj[:3, :3]).as_quat(canonical=True))
+
+    @property
+    def distance_mm(self) -> float | None:
+        """Distance from the camera to the origin of the object frame; None without a pose."""
+        return None if self.T_cam_obj is None else float(np.linalg.norm(self.T_cam_obj[:3, 3]))
+
+    def overlay(self) -> UInt8[np.ndarray, "H W 3"]:
+        """The image with the outline, the 3D box and the axes (x red, y green, z blue) of the pose.
+
+        An image smaller than 1000 px is enlarged by an integer factor.
+        """
+        return draw_results([self])
+
+    def summary(self) -> str:
+        """One line: the name, and how sure and how far the pose is, or the reason why there is none."""
+        if self.T_cam_obj is None:
+            return f"{self.name}: no pose: {self.stage}: {self.reason}"
+        x, y, z = self.T_cam_obj[:3, 3]
+        sure = f"score {self.score:.2f}" if self.confidence is None else f"confidence {self.confidence:.2f}"
+        if self.decision is not None:
+            sure += f" ({self.decision})"
+        return f"{self.name}: {sure}, at {self.distance_mm:.0f} mm (x {x:.1f}, y {y:.1f}, z {z:.1f})"
+
+
+def result_of(
+    answer: Answer, name: str, *, image: Image, model: ObjectModel, warnings: Sequence[str] = ()
+) -> PoseResult:
+    """The result of an answer."""
+    if isinstance(answer, NoEstimate):
+        return PoseResult(
+            name, None, stage=answer.stage, reason=answer.reason, warnings=tuple(warnings), image=image, model=model
+        )
+    return PoseResult(
+        name,
+        answer.T_cam_obj,
+        score=answer.score,
+        confidence=getattr(answer, "confidence", None),
+        decision=getattr(answer, "decision", None) or None,
+        alternatives=answer.alternatives,
+        warnings=tuple(warnings),
+        inliers=answer.inliers,
+        correspondences=answer.correspondences,
+        reprojection_px=answer.reprojection_px,
+        times_s=answer.times_s,
+        image=image,
+        model=model,
+    )
+
+
+def draw_results(results: Sequence[PoseResult]) -> UInt8[np.ndarray, "H W 3"]:
+    """The image of the results, with all their poses; as PoseResult.overlay."""
+    image = results[0].image
+    assert image is not None
+    poses = []
+    for result in results:
+        if result.T_cam_obj is not None and result.model is not None:
+            sure = result.score if result.confidence is None else result.confidence
+            label = f"{result.name}: {sure:.2f}"
+            poses.append(DrawnPose(result.model.mesh, result.T_cam_obj, "unchecked", label, axes=True))
+    return draw_overlay(image, poses, legend=False)
