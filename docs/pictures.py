@@ -25,7 +25,7 @@ MUG = 3  # object with a handle
 MUG_XYXY = (640, 480, 1280, 960)  # the quarter of the overlay that shows it
 VIEWS = 300  # templates of an object of the demo
 MARGIN_PX = 8
-EXCERPT = ("status", "obj_id", "T_cam_obj", "score", "inliers", "correspondences", "reprojection_px")
+EXCERPT = ("name", "status", "T_cam_obj", "score", "inliers", "correspondences", "reprojection_px")
 
 
 def main() -> None:
@@ -58,8 +58,8 @@ def write_photographs(out: Path, folder: Path, *, views: int) -> None:
     own = own_object(folder, views=2 * views)
     overlay = PIL.Image.open(own / "overlays" / "000000_000000.jpg")
     save(overlay.crop(MUG_XYXY), out / "own_object.jpg")
-    answer = json.loads((own / "poses.json").read_text())["answers"][0]
-    (out / "own_object.json").write_text(json.dumps({name: answer[name] for name in EXCERPT}, indent=1) + "\n")
+    (pose,) = json.loads((own.parents[1] / "shot" / "pose.json").read_text())["poses"]
+    (out / "own_object.json").write_text(json.dumps({name: pose[name] for name in EXCERPT}, indent=1) + "\n")
 
 
 def run(folder: Path, *overrides: str, views: int) -> Path:

@@ -4,7 +4,7 @@ import os
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["BadInput", "DzopError", "PoseEstimator", "PoseResult"]
+__all__ = ["BadInput", "DzopError", "PoseEstimator", "PoseResult", "save_results"]
 
 # Before torch starts its threads: on a busy machine threads that spin while they wait slow small operations tenfold.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -14,6 +14,7 @@ _PLACES = {
     "DzopError": "pipeline.errors",
     "PoseEstimator": "pipeline.estimator",
     "PoseResult": "pipeline.outputs.pose_result",
+    "save_results": "pipeline.outputs.photo_files",
 }
 
 

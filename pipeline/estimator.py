@@ -21,6 +21,7 @@ import numpy as np
 
 from pipeline.bop.frame import Frame, parse_image, parse_locations
 from pipeline.bop.given import MeshFiles, check_own_camera, parse_K
+from pipeline.confidence.calibration import choose_calibration
 from pipeline.configuration import build_options, build_stages, build_variant, compose_settings
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph
@@ -127,14 +128,16 @@ class PoseEstimator:
             stages, photo = build_stages(values), build_variant(values["dataset"], "dataset")
             meshes = MeshFiles(tuple(paths), photo.scale, photo.simplify, self.names)
             dataset = _make_frame(meshes, tuple(Target(SCENE_ID, IM_ID, n + 1) for n in range(len(paths))))
-            context = Context(stages, dataset, dataset.targets, store, runtime, Progress(runtime.progress))
+            calibration = choose_calibration(stages, options.confidence)
+            progress = Progress(runtime.progress)
+            context = Context(stages, dataset, dataset.targets, store, runtime, progress, calibration=calibration)
             self._open.enter_context(store.in_use())
             graph = Graph(context)
             graph.templates.banks = min(len(paths), MAX_BANKS)
             graph.check()
             graph.limit_vram()
             graph.onboard()
-            _ = context.backbone
+            _ = context.backbone, [graph.templates.extent(obj_id) for obj_id in context.object_ids]
         return graph
 
     def _frame(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> Frame:
@@ -158,7 +161,8 @@ class PoseEstimator:
         results: dict[str, list[PoseResult]] = {name: [] for name in names}
         for answer in graph.poses.estimate():
             name, model = self.names[answer.obj_id - 1], context.model(answer.obj_id)
-            results[name].append(result_of(answer, name, image=image, model=model, warnings=warnings))
+            mesh = str(frame.model_path(answer.obj_id))
+            results[name].append(result_of(answer, name, mesh=mesh, image=image, model=model, warnings=warnings))
         return tuple(result for name in names for result in results[name])
 
 

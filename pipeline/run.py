@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pipeline.bop.dataset import Dataset
+from pipeline.bop.given import GivenObjects
 from pipeline.bop.results import results_name
 from pipeline.confidence.calibration import choose_calibration, describe_confidence
 from pipeline.errors import BadInput, DzopError
@@ -24,13 +25,14 @@ from pipeline.method import Stages
 from pipeline.options import Options
 from pipeline.outputs.files import errors_by_answer, places_text, write_computed_detections, write_files
 from pipeline.outputs.folder import OutputFolder
+from pipeline.outputs.photographs import Photographs
 from pipeline.outputs.pictures import Pictures
 from pipeline.outputs.records import digest_answers, write_record
 from pipeline.parallel import use_threads
 from pipeline.progress import Progress
 from pipeline.report.run_records import read_run_records
 from pipeline.report.scores import scores_table
-from pipeline.report.summary import answers_table, failures_table, objects_table
+from pipeline.report.summary import answers_table, counts_text, failures_table, objects_table
 from pipeline.scoring import Scorer
 from pipeline.spec import Runtime
 from pipeline.store import Store
@@ -167,9 +169,13 @@ def _estimate(graph: Graph, options: Options) -> str:
     pictures = Pictures(folder, answers, evaluation)
     if options.overlays:
         pictures.draw_overlays()
-    _print_results(answers, evaluation, folder.context, options)
+    if isinstance(folder.context.dataset, GivenObjects):
+        written = _write_photographs(Photographs(folder, pictures, answers, warnings))
+    else:
+        written = []
+        _print_results(answers, evaluation, folder.context, options)
     _print_warnings(warnings)
-    print(places_text(folder, overlays=options.overlays))
+    print(places_text(folder, written, overlays=options.overlays))
     if evaluation is not None:
         cases = pictures.draw_gallery(options.gallery)
         print(f"record    {write_record(folder, answers, evaluation, cases)}")
@@ -225,8 +231,7 @@ def _print_results(
     failures = [answer for answer in answers if isinstance(answer, NoEstimate)]
     if failures:
         print("\n" + failures_table(failures))
-    reasons = " (each with its reason)" if failures else ""
-    print(f"\nposes found: {len(answers) - len(failures)}, failed: {len(failures)}{reasons}")
+    print(f"\n{counts_text(answers)}")
     print(_decisions_text(answers, context, options.confidence))
     if evaluation is None:
         return
@@ -235,6 +240,16 @@ def _print_results(
     if evaluation.correspondences:
         median = np.median(list(evaluation.correspondences.values()))
         print(f"correspondences: median error {median:.1%} of the diameter, parallel to the image plane")
+
+
+def _write_photographs(photographs: Photographs) -> list[Path]:
+    """Write the folder of every photograph and print the results; returns the folders."""
+    context, options = photographs.folder.context, photographs.folder.options
+    written = photographs.write(overlays=options.overlays, cards=options.gallery > 0)
+    print(f"\n{photographs.text()}\n\n{counts_text(photographs.answers)}")
+    if note := describe_confidence(context.stages, context.calibration, options.confidence):
+        print(note)
+    return written
 
 
 def _decisions_text(answers: Sequence[Answer], context: Context, choice: str) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.bop.masks import decode_rle
-from pipeline.bop.symmetries import SYMMETRIES_VERSION, mesh_symmetries, transforms_of
-from pipeline.confidence.evidence import Extent, collect_evidence, measure_extent
+from pipeline.bop.symmetries import SYMMETRIES_VERSION
+from pipeline.confidence.evidence import collect_evidence
 from pipeline.errors import NoPose
 from pipeline.functional.depth_fit import fit_depth
 from pipeline.functional.symmetry import make_canonical
@@ -263,21 +263,10 @@ class PoseNodes:
             return {}, ()
         route = Route(self.context.stages, query, bank)
         geometry = route.geometry(route.view(trace.best), trace.best.pair)
-        return collect_evidence(trace, query, geometry, self._extent(obj_id))
-
-    @cached_property
-    def _extent(self) -> Callable[[int], Extent]:
-        """What distances between poses of an object are measured on."""
-        return lru_cache(maxsize=None)(self._measure_extent)
-
-    def _measure_extent(self, obj_id: int) -> Extent:
-        model = self.context.model(obj_id)
-        if self.context.dataset.finds_symmetries:
-            model = replace(model, symmetries=transforms_of(mesh_symmetries(model.mesh, model.diameter_mm)[1]))
-        return measure_extent(model)
+        return collect_evidence(trace, query, geometry, self.templates.extent(obj_id))
 
     def _canonical(self, T_cam_obj: Float[np.ndarray, "4 4"], obj_id: int) -> Float[np.ndarray, "4 4"]:
         """The pose, or that of its symmetric copies that stands for all of them where symmetries were found."""
         if not self.context.dataset.finds_symmetries:
             return T_cam_obj
-        return make_canonical(T_cam_obj, self._extent(obj_id).symmetries)
+        return make_canonical(T_cam_obj, self.templates.extent(obj_id).symmetries)

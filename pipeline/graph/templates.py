@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from pipeline.bop.symmetries import mesh_symmetries, transforms_of
+from pipeline.confidence.evidence import Extent, measure_extent
 from pipeline.errors import DzopError
 from pipeline.fits import chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
@@ -309,6 +311,17 @@ class TemplateNodes:
             poses=lambda: templates.array("T_cam_obj"),
             fitted=fitted,
         )
+
+    @cached_property
+    def extent(self) -> Callable[[int], Extent]:
+        """What distances between poses of an object are measured on."""
+        return lru_cache(maxsize=None)(self._measure_extent)
+
+    def _measure_extent(self, obj_id: int) -> Extent:
+        model = self.context.model(obj_id)
+        if self.context.dataset.finds_symmetries:
+            model = replace(model, symmetries=transforms_of(mesh_symmetries(model.mesh, model.diameter_mm)[1]))
+        return measure_extent(model)
 
     def _open(self, obj_id: int) -> tuple[dict[int, Entry], Entry, Entry]:
         """Entries of an object's features by layer, its crops and its templates."""

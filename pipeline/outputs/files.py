@@ -49,9 +49,14 @@ def write_files(
     write_json(folder.path / "poses.json", record)
 
 
-def places_text(folder: OutputFolder, *, overlays: bool) -> str:
-    """Lines for the terminal that name every file and folder that was written."""
-    lines = [f"csv       {folder.path / folder.csv_name}", f"poses     {folder.path / 'poses.json'}"]
+def places_text(folder: OutputFolder, photographs: Sequence[Path] = (), *, overlays: bool) -> str:
+    """Lines for the terminal that name every file and folder that was written, those of photographs first."""
+    lines = []
+    for photograph in photographs:
+        lines.append(f"pose      {photograph / 'pose.json'}")
+        if overlays:
+            lines += [f"overlay   {photograph / 'overlay.jpg'}", f"page      {photograph / 'pose.html'}"]
+    lines += [f"csv       {folder.path / folder.csv_name}", f"poses     {folder.path / 'poses.json'}"]
     if folder.graph.detections.proposals:
         lines.append(f"detected  {folder.detections}")
     if overlays:

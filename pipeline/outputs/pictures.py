@@ -22,6 +22,7 @@ from pipeline.outputs.files import errors_by_answer
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.gallery import Card, draw_card, pick_cases
 from pipeline.report.overlay import DrawnPose, draw_overlay, shows, write_overlay
+from pipeline.report.panels import Picture
 from pipeline.report.run_records import Case
 from pipeline.spec import digest
 
@@ -85,6 +86,11 @@ class Pictures:
         self._count("gallery", drawn, len(chosen), start)
         cases = [self._case(index) for index in chosen]
         return [case for case in cases if shows(self.folder.path / case.file, self.made_from)]
+
+    def draw_card(self, index: int) -> Picture | None:
+        """How an answer came about; None where there is nothing to show."""
+        replayed = self.folder.graph.replayer()(self.answers[index])
+        return None if replayed is None else draw_card(self._card(index, replayed))
 
     def _count(self, step: str, drawn: int, total: int, start: float) -> None:
         seconds = time.perf_counter() - start

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -25,7 +26,7 @@ class PoseResult:
     probability that the pose is right, and ``decision`` what to do with it (accept, check or reject); None where no
     calibration exists. ``alternatives``: other poses that were found, best first. ``warnings``: what is suspicious
     about mesh, camera, mask or box. ``correspondences``: point matches, of which ``inliers`` agree with the pose.
-    ``times_s``: seconds by stage.
+    ``times_s``: seconds by stage. ``mesh``: the mesh's file.
     """
 
     name: str
@@ -41,6 +42,7 @@ class PoseResult:
     correspondences: int = 0
     reprojection_px: float | None = None
     times_s: Mapping[str, float] = field(default_factory=dict)
+    mesh: str = ""
     image: Image | None = field(default=None, repr=False)
     model: ObjectModel | None = field(default=None, repr=False)
 
@@ -68,6 +70,35 @@ class PoseResult:
         """
         return draw_results([self])
 
+    def to_record(self) -> dict[str, Any]:
+        """The result as a pose of pose.json (docs/python.md has its fields)."""
+        T, quaternion = self.T_cam_obj, self.quaternion_xyzw
+        return {
+            "name": self.name,
+            "mesh": self.mesh,
+            "status": "estimate" if self.found else "none",
+            "T_cam_obj": None if T is None else T.tolist(),
+            "quaternion_xyzw": None if quaternion is None else quaternion.tolist(),
+            "distance_mm": self.distance_mm,
+            "score": self.score,
+            "confidence": self.confidence,
+            "decision": self.decision,
+            "alternatives": [
+                {"T_cam_obj": other.T_cam_obj.tolist(), "support": other.support, "weight": other.weight}
+                for other in self.alternatives
+            ],
+            "stage": self.stage,
+            "reason": self.reason,
+            "inliers": self.inliers,
+            "correspondences": self.correspondences,
+            "reprojection_px": self.reprojection_px,
+        }
+
+    def details(self) -> str:
+        """The reprojection error and the seconds, for the terminal."""
+        error = "" if self.reprojection_px is None else f", {self.reprojection_px:.2f} px apart"
+        return f"{error}; {sum(self.times_s.values()):.1f} s"
+
     def summary(self) -> str:
         """One line: the name, and how sure and how far the pose is, or the reason why there is none."""
         if self.T_cam_obj is None:
@@ -80,25 +111,26 @@ class PoseResult:
 
 
 def result_of(
-    answer: Answer, name: str, *, image: Image, model: ObjectModel, warnings: Sequence[str] = ()
+    answer: Answer, name: str, *, mesh: str, image: Image, model: ObjectModel, warnings: Sequence[str] = ()
 ) -> PoseResult:
     """The result of an answer."""
     if isinstance(answer, NoEstimate):
-        return PoseResult(
-            name, None, stage=answer.stage, reason=answer.reason, warnings=tuple(warnings), image=image, model=model
-        )
+        stage, reason = answer.stage, answer.reason
+        about = tuple(warnings)
+        return PoseResult(name, None, stage=stage, reason=reason, warnings=about, mesh=mesh, image=image, model=model)
     return PoseResult(
         name,
         answer.T_cam_obj,
         score=answer.score,
-        confidence=getattr(answer, "confidence", None),
-        decision=getattr(answer, "decision", None) or None,
+        confidence=answer.confidence,
+        decision=answer.decision or None,
         alternatives=answer.alternatives,
         warnings=tuple(warnings),
         inliers=answer.inliers,
         correspondences=answer.correspondences,
         reprojection_px=answer.reprojection_px,
         times_s=answer.times_s,
+        mesh=mesh,
         image=image,
         model=model,
     )

@@ -73,6 +73,12 @@ def objects_table(rows: Sequence[AnswerWithErrors]) -> str:
     return "\n".join([*lines, note])
 
 
+def counts_text(answers: Sequence[Answer]) -> str:
+    """How many answers are poses."""
+    failures = sum(isinstance(answer, NoEstimate) for answer in answers)
+    return f"poses found: {len(answers) - failures}, failed: {failures}{' (each with its reason)' if failures else ''}"
+
+
 def failures_table(missing: Sequence[NoEstimate]) -> str:
     """Number of answers without a pose, by stage and reason, the most frequent first."""
     counts = Counter((answer.stage, answer.reason) for answer in missing)

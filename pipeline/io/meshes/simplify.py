@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.metadata import version
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.functional.arrays import rank_rows
 from pipeline.functional.surface import spread_points, surface_distance
@@ -66,3 +68,31 @@ def _measure_distance(first: Mesh, second: Mesh) -> float:
     there = surface_distance(points, second.vertices, second.faces, on_second)
     points = np.concatenate([on_second.interpolate(second.vertices, second.faces), second.vertices[:_MEASURED]])
     return max(there, surface_distance(points, first.vertices, first.faces, on_first))
+
+
+def thin_mesh(mesh: Mesh, faces: int, *, texture_px: int) -> Mesh:
+    """A mesh to look at, quickly made: about ``faces`` faces at most, and a texture of at most ``texture_px`` a side.
+
+    A mesh of more faces has colours of vertices instead of its texture. Its geometry is not for estimating poses.
+    """
+    if len(mesh.faces) <= faces:
+        return mesh if mesh.texture is None else replace(mesh, texture=_shrink(mesh.texture, texture_px))
+    from scipy.spatial import cKDTree
+
+    vertices, few = _collapse(mesh, faces)
+    colours = mesh.colours
+    if mesh.texture is not None and mesh.uv is not None:
+        (h, w), uv = mesh.texture.shape[:2], mesh.uv % 1.0
+        rows, columns = np.rint((1 - uv[:, 1]) * (h - 1)), np.rint(uv[:, 0] * (w - 1))
+        colours = mesh.texture[rows.astype(int), columns.astype(int)]
+    if colours is not None:
+        colours = colours[cKDTree(mesh.vertices).query(vertices)[1]]
+    return Mesh(vertices, few, colours=colours)
+
+
+def _shrink(texture: UInt8[np.ndarray, "H W 3"], texture_px: int) -> UInt8[np.ndarray, "h w 3"]:
+    scale = texture_px / max(texture.shape[:2])
+    if scale >= 1:
+        return texture
+    size = max(1, round(texture.shape[1] * scale)), max(1, round(texture.shape[0] * scale))
+    return np.asarray(cv2.resize(texture, size, interpolation=cv2.INTER_AREA))

@@ -1,0 +1,100 @@
+"""Results of one photograph -> pose.json, overlay.jpg and pose.html in a folder that a person finds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from pipeline.io.files import write_atomic, write_json
+from pipeline.outputs.pose_result import PoseResult, draw_results
+from pipeline.report.overlay import write_overlay
+from pipeline.report.pose_page import PosePage, ShownPose
+from pipeline.report.scene_page import scene_html
+
+FRAME = (
+    "T_cam_obj maps points of the object to the camera, p_cam = T_cam_obj p_obj, in millimetres. Camera: origin in the "
+    "optical centre, x right, y down, z forward (OpenCV). Object: coordinates of the mesh file times dataset.scale."
+)
+LATEST = "latest"
+Cards = Sequence[UInt8[ndarray, "_H _W 3"] | None]
+
+
+def save_results(
+    results: Sequence[PoseResult],
+    folder: str | PathLike[str],
+    *,
+    image: str = "",
+    more: dict[str, Any] | None = None,
+    overlay: bool = True,
+    cards: Callable[[], Cards] | None = None,
+    note: str = "",
+) -> list[Path]:
+    """Write results of one image to a folder: pose.json, and with ``overlay`` overlay.jpg and pose.html.
+
+    ``image``: the photograph's file. ``more``: further fields of pose.json. ``cards``: draws how each pose was found,
+    for the page. ``note``: what was done to the photograph. Returns the files. Raises DzopError.
+    """
+    to = Path(folder)
+    files = [_write_json(to, results, image=image, more=more or {})]
+    if overlay:
+        drawn = draw_results(results)
+        write_overlay(to / "overlay.jpg", drawn)
+        page = _page(results, drawn, title=image or to.name, cards=cards() if cards else (), note=note)
+        write_atomic(to / "pose.html", page.html())
+        files += [to / "overlay.jpg", to / "pose.html"]
+    return files
+
+
+def link_latest(folder: Path) -> None:
+    """Let ``latest`` beside the folder point to it, where the file system has symbolic links."""
+    link = folder.parent / LATEST
+    new = folder.parent / f".{LATEST}.{os.getpid()}.partial"
+    if link.exists() and not link.is_symlink():
+        return
+    with suppress(OSError):
+        new.unlink(missing_ok=True)
+        new.symlink_to(folder.name, target_is_directory=True)
+        new.replace(link)
+
+
+def _write_json(folder: Path, results: Sequence[PoseResult], *, image: str, more: dict[str, Any]) -> Path:
+    shown = results[0].image
+    record = {
+        "image": image,
+        "K": None if shown is None else [float(shown.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+        "units": "mm",
+        "frame": FRAME,
+        "warnings": _warnings(results),
+        **more,
+        "poses": [result.to_record() for result in results],
+    }
+    write_json(folder / "pose.json", record)
+    return folder / "pose.json"
+
+
+def _page(results: Sequence[PoseResult], drawn: ndarray, *, title: str, cards: Cards, note: str) -> PosePage:
+    image = results[0].image
+    assert image is not None
+    given = [*cards, *[None] * (len(results) - len(cards))]
+    placed = [(r.model.mesh, r.T_cam_obj) for r in results if r.model is not None and r.T_cam_obj is not None]
+    h, w = image.rgb.shape[:2]
+    return PosePage(
+        title,
+        image.rgb,
+        drawn,
+        [ShownPose(r.name, r.summary(), r.T_cam_obj, card) for r, card in zip(results, given, strict=True)],
+        _warnings(results),
+        scene_html(placed, image.K, (h, w)) if placed else "",
+        note,
+    )
+
+
+def _warnings(results: Sequence[PoseResult]) -> list[str]:
+    return list(dict.fromkeys(text for result in results for text in result.warnings))

@@ -1,0 +1,104 @@
+"""Answers of a run on given photographs -> a folder for each photograph, and lines for the terminal."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+from pipeline.bop.jsonio import read_json
+from pipeline.errors import BadInput
+from pipeline.graph.context import ImageId
+from pipeline.items.records import Answer
+from pipeline.outputs.folder import OutputFolder
+from pipeline.outputs.photo_files import LATEST, Cards, link_latest, save_results
+from pipeline.outputs.pictures import Pictures
+from pipeline.outputs.pose_result import PoseResult, result_of
+
+FILES_VERSION = 1
+"""Raise it when the files of the same results look different."""
+RESERVED = (LATEST, "report", "multirun", "records")  # other things in the folder of results
+
+
+@dataclass(eq=False)
+class Photographs:
+    """The results of a run, by photograph."""
+
+    folder: OutputFolder
+    pictures: Pictures
+    answers: Sequence[Answer]
+    warnings: Sequence[str]
+
+    @cached_property
+    def results(self) -> list[PoseResult]:
+        """The result of each answer."""
+        context, data = self.folder.context, self.folder.context.dataset
+        images = {image: data.image(*image) for image in context.image_ids}
+        return [
+            result_of(
+                answer,
+                data.object_name(answer.obj_id),
+                mesh=str(data.model_path(answer.obj_id)),
+                image=images[answer.scene_id, answer.im_id],
+                model=context.model(answer.obj_id),
+                warnings=self.warnings,
+            )
+            for answer in self.answers
+        ]
+
+    def write(self, *, overlays: bool, cards: bool) -> list[Path]:
+        """Write the folder of every photograph, unless it holds these results already; returns the folders."""
+        by_image: defaultdict[ImageId, list[int]] = defaultdict(list)
+        for index, answer in enumerate(self.answers):
+            by_image[answer.scene_id, answer.im_id].append(index)
+        data, folders = self.folder.context.dataset, []
+        for image, indices in by_image.items():
+            folder = self.folder.out / _folder_name(data.image_name(*image))
+            more = {"run": str(self.folder.path), "made_from": f"{FILES_VERSION} {self.pictures.made_from}"}
+            wanted = ["pose.json", *(["overlay.jpg", "pose.html"] if overlays else [])]
+            if not _holds(folder, wanted, more["made_from"]):
+                save_results(
+                    [self.results[index] for index in indices],
+                    folder,
+                    image=str(data.image_path(*image)),
+                    more=more,
+                    overlay=overlays,
+                    cards=partial(self._cards, indices) if cards else None,
+                    note=data.image_note,
+                )
+            folders.append(folder)
+        if folders:
+            link_latest(folders[-1])
+        return folders
+
+    def text(self) -> str:
+        """One line per result, with the photograph's name if there are several."""
+        data, several = self.folder.context.dataset, len(self.folder.context.image_ids) > 1
+        lines = []
+        for answer, result in zip(self.answers, self.results, strict=True):
+            image = f"{data.image_name(answer.scene_id, answer.im_id)}: " if several else ""
+            lines.append(f"{image}{result.summary()}")
+            if result.found:
+                lines.append(f"  {result.inliers} of {result.correspondences} matches agree{result.details()}")
+        return "\n".join(lines)
+
+    def _cards(self, indices: Sequence[int]) -> Cards:
+        return [self.pictures.draw_card(index) for index in indices]
+
+
+def _folder_name(image_name: str) -> str:
+    name = Path(image_name).stem.lstrip(".") or "photograph"
+    return f"{name}_" if name in RESERVED else name
+
+
+def _holds(folder: Path, names: Sequence[str], made_from: str) -> bool:
+    """Whether all files are there and pose.json was made from these results."""
+    if not all((folder / name).is_file() for name in names):
+        return False
+    try:
+        record = read_json(folder / "pose.json")
+    except BadInput:
+        return False
+    return isinstance(record, dict) and record.get("made_from") == made_from
