@@ -13,7 +13,7 @@ from pipeline.errors import DzopError
 from pipeline.store.arrays import READ_ERRORS, open_array, present_rows, read_attributes, write_attributes
 from pipeline.store.backends import Backend
 from pipeline.store.checksums import ChunkChecker, RowChecksums, from_hex
-from pipeline.store.chunks import has_raw_chunks, read_rows
+from pipeline.store.chunks import ChunkFiles
 from pipeline.store.completion import check_format, metadata_digest, withdraw_record
 from pipeline.store.keys import Ref
 from pipeline.store.remote import AccessDenied
@@ -103,8 +103,8 @@ class Entry:
             raise DzopError(f"{where}: array {name} cannot be read ({error.strerror})") from None
 
     def _read(self, name: str, array: zarr.Array, rows: range | list[int]) -> np.ndarray:
-        if self.backend.folder is not None and has_raw_chunks(array):
-            return read_rows(self.backend.folder, array, rows, self._checksums(name))
+        if (files := ChunkFiles.of(self.backend.folder, array)) is not None:
+            return files.read(rows, self._checksums(name))
         first = rows[0] if rows else 0
         if list(rows) == list(range(first, first + len(rows))):  # one request for a whole batch
             return np.asarray(array[first : first + len(rows)])

@@ -40,7 +40,8 @@ from pipeline.store.arrays import (
     write_bytes,
 )
 from pipeline.store.backends import Announce, Backend
-from pipeline.store.checksums import ChunkRecorder, chunk_key, is_intact, to_hex
+from pipeline.store.checksums import ChunkRecorder, RowChecksums, chunk_key, is_intact, to_hex
+from pipeline.store.chunks import ChunkFiles
 from pipeline.store.completion import check_format, complete_attributes, completion_record, identity
 from pipeline.store.entry import mark_incomplete
 from pipeline.store.journal import StoredRows, forget_rows, note_end, note_rows, read_journal
@@ -176,15 +177,19 @@ class EntryWriter:
             block = np.asarray(values[name])
             if block.shape != (len(rows), *array.shape[1:]):
                 raise AssertionError(f"{name}: rows of shape {block.shape}, array {array.shape}")
-            array[rows[0] : rows[-1] + 1] = block
-        for row in rows:
-            for name, key in self._keys(self.folder, row).items():
-                self.checksums[name][row] = self.recorder.written.pop(key)
+            self.checksums[name].update(self._write_block(name, array, block, rows))
         self.stored.update(rows)
         self._not_noted += rows
         due = not self.backend.has_locks or time.monotonic() - self._noted_s > _NOTE_INTERVAL_S
         if due and len(self.stored) < self.rows:  # completion follows the last batch at once
             self.note()
+
+    def _write_block(self, name: str, array: zarr.Array, block: np.ndarray, rows: Sequence[int]) -> RowChecksums:
+        """Store consecutive rows of one array, directly where that is possible; returns their checksums."""
+        if (files := ChunkFiles.of(self.backend.folder, array)) is not None:
+            return files.write(rows, block)
+        array[rows[0] : rows[-1] + 1] = block
+        return {row: self.recorder.written.pop(self._keys(self.folder, row)[name]) for row in rows}
 
     def note(self) -> None:
         """Add what was stored since the last call to the journal."""

@@ -68,7 +68,7 @@ class Failing(WrapperStore):
 
 def opened(root: Path, failing: Failing) -> Store:
     store = Store(LocalStoreConfig(root=str(root)))
-    store.backend = replace(store.backend, zarr=RemoteStore(failing, "s3://bucket/prefix"))
+    store.backend = replace(store.backend, zarr=RemoteStore(failing, "s3://bucket/prefix"), folder=None)
     return store
 
 
