@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.spatial.distance import cdist
 
 from pipeline.errors import BadInput
-from pipeline.functional.shading import texture_colour
+from pipeline.functional.shading import Mipmap, texture_colour
 from pipeline.io.meshes import diameter_mm, identify_mesh, read_mesh, write_ply
 from pipeline.items.objects import Mesh
 
@@ -88,7 +88,7 @@ def test_every_format_maps_the_same_texel_to_the_same_corner(write, tmp_path):
     mesh = read_mesh(write(tmp_path))
     for corner, quarter in zip(SQUARE, CORNER_QUARTER, strict=True):
         at = np.flatnonzero((mesh.vertices == corner).all(axis=1))
-        colour = texture_colour([mesh.texture], mesh.uv[at], np.ones(len(at)))
+        colour = texture_colour(Mipmap.of([mesh.texture]), mesh.uv[at], np.ones(len(at)))
         np.testing.assert_array_equal(colour, np.tile(QUARTERS[quarter], (len(at), 1)))
 
 
@@ -222,7 +222,7 @@ def test_two_textures_share_an_atlas_with_repeats_written_out(tmp_path):
 
     def at(corner):
         rows = np.flatnonzero((mesh.vertices == corner).all(axis=1))
-        return texture_colour([mesh.texture], mesh.uv[rows], np.ones(len(rows)))
+        return texture_colour(Mipmap.of([mesh.texture]), mesh.uv[rows], np.ones(len(rows)))
 
     for corner, quarter in zip(SQUARE, CORNER_QUARTER, strict=True):
         for layer, colour in enumerate((QUARTERS[quarter], (200, 100, 50), (51, 102, 153))):

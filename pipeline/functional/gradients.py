@@ -7,7 +7,9 @@ import math
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
+
+from pipeline.functional.maps import normalize_channels
 
 ORIENTATIONS, CONTRAST = 8, 0.02
 NEIGHBOURHOOD = 9  # cells whose histograms append_edges concatenates
@@ -31,7 +33,7 @@ def append_edges(
     the histograms' by up to ``weight`` squared.
     """
     edges = append_neighbours(histograms, distance=1, contrast=CONTRAST)
-    return torch.cat([normalize(descriptors.float(), dim=1), weight * edges], dim=1)
+    return torch.cat([normalize_channels(descriptors.float()), weight * edges], dim=1)
 
 
 def oriented_energy(

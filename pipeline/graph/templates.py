@@ -218,18 +218,22 @@ class TemplateNodes:
         fuse, block = stages.fuse, stages.second_look.block
 
         @cache
-        def inputs() -> tuple[tuple[dict[int, Entry], Entry, Entry], FittedArrays]:
+        def inputs() -> tuple[dict[int, Entry], Entry, FittedArrays]:
             fitted = {} if fuse.fit is None else self.read_fitted(obj_id, fuse.fit, device=self.context.device)
-            return self._open(obj_id), fitted
+            features, crops, _ = self._open(obj_id)
+            return {layer: features[layer] for layer in fuse.layers}, crops, fitted
 
         def encode(crop: CropFeatures) -> np.ndarray:
-            encoded = coarsen(fuse.encode(crop, inputs()[1]), block=block)
+            encoded = coarsen(fuse.encode(crop, inputs()[2]), block=block)
             maps = torch.cat([encoded.features, encoded.mask[None]]).movedim(0, -1).contiguous()
             return to_half(maps, "encodings of templates")
 
         def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
-            crops = [self._readers(*inputs()[0], row)["crop"]() for row in rows]
-            return {ref.key: {"maps": np.stack(list(ordered_map(encode, crops)))}}
+            features, crops, _ = inputs()
+            maps = {layer: self.context.tensor(entry.array("maps", rows)) for layer, entry in features.items()}
+            masks = self.context.tensor(crops.array("mask", rows))
+            each = [CropFeatures({layer: m[k] for layer, m in maps.items()}, mask) for k, mask in enumerate(masks)]
+            return {ref.key: {"maps": np.stack(list(ordered_map(encode, each)))}}
 
         timing = timing_key("template encodings", stages)
         layouts = {ref: self.encodings_layout()}

@@ -62,6 +62,7 @@ class Entry:
     record: Mapping[str, Any]
     on_use: Callable[[Ref, Mapping[str, Any] | None], None]
     checked_arrays: dict[str, zarr.Array] = field(default_factory=dict, repr=False)
+    _files: dict[str, ChunkFiles | None] = field(default_factory=dict, repr=False)
     _parsed: dict[str, RowChecksums] = field(default_factory=dict, repr=False)
 
     @property
@@ -103,7 +104,7 @@ class Entry:
             raise DzopError(f"{where}: array {name} cannot be read ({error.strerror})") from None
 
     def _read(self, name: str, array: zarr.Array, rows: range | list[int]) -> np.ndarray:
-        if (files := ChunkFiles.of(self.backend.folder, array)) is not None:
+        if (files := self._files[name]) is not None:
             return files.read(rows, self._checksums(name))
         first = rows[0] if rows else 0
         if list(rows) == list(range(first, first + len(rows))):  # one request for a whole batch
@@ -118,7 +119,7 @@ class Entry:
         array = open_array(ChunkChecker(self.backend.zarr, path, self._checksums(name)), path)
         if array is None or metadata_digest(array) != self.record["arrays"].get(name):
             raise self._damaged(f"the metadata of array {name} changed after completion")
-        self.checked_arrays[name] = array
+        self.checked_arrays[name], self._files[name] = array, ChunkFiles.of(self.backend.folder, array)
         return array
 
     def _checksums(self, name: str) -> RowChecksums | None:

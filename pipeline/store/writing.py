@@ -101,6 +101,7 @@ class EntryWriter:
     folder: str
     recorder: ChunkRecorder
     arrays: dict[str, zarr.Array] = field(default_factory=dict)
+    files: dict[str, ChunkFiles | None] = field(default_factory=dict)
     checksums: dict[str, dict[int, bytes]] = field(default_factory=dict)
     stored: set[int] = field(default_factory=set)
     _not_noted: list[int] = field(default_factory=list)
@@ -125,7 +126,7 @@ class EntryWriter:
             path = writer._path(folder, array)
             create = create_array if folder else _open_or_create_array
             writer.arrays[array] = create(writer.recorder, path, layout, rows)
-            writer.checksums[array] = {}
+            writer.checksums[array], writer.files[array] = {}, ChunkFiles.of(backend.folder, writer.arrays[array])
         for found in journal:
             writer._keep(found)
         writer._has_notes = bool(journal)
@@ -186,7 +187,7 @@ class EntryWriter:
 
     def _write_block(self, name: str, array: zarr.Array, block: np.ndarray, rows: Sequence[int]) -> RowChecksums:
         """Store consecutive rows of one array, directly where that is possible; returns their checksums."""
-        if (files := ChunkFiles.of(self.backend.folder, array)) is not None:
+        if (files := self.files[name]) is not None:
             return files.write(rows, block)
         array[rows[0] : rows[-1] + 1] = block
         return {row: self.recorder.written.pop(self._keys(self.folder, row)[name]) for row in rows}

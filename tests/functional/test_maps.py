@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pipeline.functional.maps import block_means
+from pipeline.functional.maps import block_means, normalize_channels
 from pipeline.stages.fuse import EncodedMap, coarse_shape, coarsen
 
 
@@ -14,6 +14,12 @@ def test_a_block_is_the_mean_of_its_foreground_cells():
             inside = features[:, *part][:, mask[part]]
             torch.testing.assert_close(coarse[:, y, x], inside.mean(1))
             assert bool(covered[y, x]) == (mask[part].sum() >= 8)
+
+
+def test_cells_are_scaled_with_the_bytes_of_torchs_norm():
+    maps = 3 * torch.randn((2, 64, 7, 9), generator=torch.Generator().manual_seed(0))
+    maps[0, :, 2, 3] = 0
+    assert torch.equal(normalize_channels(maps), torch.nn.functional.normalize(maps, dim=1))
 
 
 def test_a_mask_smaller_than_a_block_keeps_its_block():

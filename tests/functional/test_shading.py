@@ -1,6 +1,6 @@
 import numpy as np
 
-from pipeline.functional.shading import corner_normals, mip_levels, shade, texel_density, texture_colour
+from pipeline.functional.shading import Mipmap, corner_normals, mip_levels, shade, texel_density, texture_colour
 from pipeline.functional.viewpoints import icosphere_mesh
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
@@ -41,8 +41,8 @@ def test_fine_stripes_are_grey_from_a_distance():
     stripes = np.zeros((64, 64, 3), np.uint8)
     stripes[:, ::2] = 200
     uv = np.random.default_rng(0).uniform(size=(500, 2))
-    near = texture_colour(mip_levels(stripes), uv, np.ones(500))
-    far = texture_colour(mip_levels(stripes), uv, np.full(500, 4.0))
+    near = texture_colour(Mipmap.of(mip_levels(stripes)), uv, np.ones(500))
+    far = texture_colour(Mipmap.of(mip_levels(stripes)), uv, np.full(500, 4.0))
     assert near.std() > 50
     np.testing.assert_allclose(far, 100, rtol=1e-6)  # float32
 

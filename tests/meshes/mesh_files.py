@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pipeline.functional.shading import texture_colour
+from pipeline.functional.shading import Mipmap, texture_colour
 from pipeline.items.objects import Mesh
 
 # a square of side 10 in two triangles; the texture has one colour per quarter
@@ -49,7 +49,7 @@ def colours_at(mesh: Mesh, point: np.ndarray) -> np.ndarray:
     at = np.flatnonzero(np.abs(mesh.vertices - point).max(axis=-1) < 1e-3)
     assert len(at), point
     if mesh.texture is not None:
-        return texture_colour([mesh.texture], mesh.uv[at], np.ones(len(at)))
+        return texture_colour(Mipmap.of([mesh.texture]), mesh.uv[at], np.ones(len(at)))
     assert mesh.colours is not None
     return mesh.colours[at].astype(float)
 

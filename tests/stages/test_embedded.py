@@ -13,6 +13,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.gradients import EDGES
 from pipeline.items.features import CropFeatures
 from pipeline.items.views import Crops
+from pipeline.parallel import one_thread_per_kernel
 from pipeline.spec import Runtime
 from pipeline.stages.extract import embedded
 from pipeline.stages.extract.embedded import FOLDER, Embedded
@@ -49,6 +50,13 @@ def test_edges_do_not_depend_on_the_batch_or_the_weights():
             Embedded(weights="pure").load(Runtime(device="cpu"))(many[k : k + 1], ALL)[EDGES][0], whole[k]
         )
     assert Embedded(input_size=256).feature_shape(EDGES) == (8, 128, 128)
+
+
+def test_the_vae_encodes_small_images_in_fours_with_the_bytes_of_one():
+    backbone = Embedded().load(Runtime(device="cpu"))
+    rgb = np.random.default_rng(0).integers(0, 256, (6, 128, 128, 3), dtype=np.uint8)
+    with one_thread_per_kernel(), torch.inference_mode():
+        assert torch.equal(backbone._encode(rgb), torch.cat([backbone._encode(image[None]) for image in rgb]))
 
 
 def test_edges_count_in_the_footprint():

@@ -19,6 +19,7 @@ from pipeline.items.objects import Mesh
 from pipeline.spec import build
 from pipeline.stages.render.auto import Auto
 from pipeline.stages.render.pyrender import Pyrender
+from pipeline.stages.render.ray_mesh import get_caster
 from pipeline.stages.render.raycast import Raycast, render_depth, surface_points
 from pipeline.synthetic.objects import make_object
 
@@ -212,6 +213,24 @@ def test_an_object_outside_the_image_behind_or_around_the_camera_is_no_error():
     assert (around > 0).all()
     assert around.max() <= 50
     assert (touching > 0).any()
+
+
+@pytest.mark.parametrize("turn_deg", [0, 10, 45, 90])
+def test_only_pixels_that_cannot_show_the_mesh_are_left_out(turn_deg):
+    """The pixels inside the outline of the bounding box: every ray that hits the mesh, and no whole rectangle."""
+    K = np.array([[900.0, 0, 60.3], [0, 880, 41.8], [0, 0, 1]])
+    for mesh in (make_object(1), Mesh(np.array([[-9.0, 0, 0], [9, 0, 0], [9, 30, 0]]), np.array([[0, 1, 2]]))):
+        caster = get_caster(mesh)
+        angle = np.radians(turn_deg)
+        T = np.eye(4)
+        T[:3, :3] = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        T[2, 3] = 10 * caster.radius
+        everywhere = np.stack(np.meshgrid(np.arange(130), np.arange(90)), axis=-1).reshape(-1, 2)
+        hits = {tuple(px) for px in everywhere[caster.cast(K, T, everywhere).ray]}
+        covered = [tuple(px) for px in caster.covered_pixels(K, T, (90, 130))]
+        assert hits <= set(covered)
+        assert len(covered) == len(set(covered))
+        assert covered == sorted(covered, key=lambda px: (px[1], px[0]))
 
 
 def test_surface_points_face_the_camera_and_agree_with_the_depth_map():

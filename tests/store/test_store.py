@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,31 @@ def test_a_row_of_zeros_is_stored(store: Store):
         {REF: LAYOUT}, rows=2, batch=2, compute=lambda rows: {REF.key: {"maps": np.zeros((2, 3, 4), np.float16)}}
     )
     np.testing.assert_array_equal(store.read(REF).array("maps"), np.zeros((2, 3, 4)))
+
+
+def test_chunks_written_directly_are_those_that_zarr_writes(tmp_path: Path):
+    random = np.random.default_rng(0)
+    values = {
+        "maps": random.standard_normal((5, 6, 4)).astype(np.float16),
+        "rgb": random.integers(0, 3, (5, 32, 32, 3)).astype(np.uint8),
+        "mask": random.random((5, 9, 9)) > 0.5,
+        "depth_mm": np.zeros((5, 20, 20), np.float32),
+    }
+    layouts = {name: Layout(v.shape[1:], v.dtype.name, compress=name != "maps") for name, v in values.items()}
+    found, ref = [], make_ref("entries", {"kind": "entry"}, {})
+    for folder, is_direct in ((tmp_path / "direct", True), (tmp_path / "zarr", False)):
+        store = Store(LocalStoreConfig(root=str(folder)))
+        if not is_direct:
+            store.backend = replace(store.backend, folder=None)
+        store.fill(
+            {ref: layouts}, rows=5, batch=2, compute=lambda rows: {ref.key: {n: v[rows] for n, v in values.items()}}
+        )
+        for reader in (store, Store(LocalStoreConfig(root=str(folder)))):
+            for name, expected in values.items():
+                assert np.array_equal(reader.read(ref).array(name, [3, 1]), expected[[3, 1]])
+        found.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("c/**/*") if path.is_file()})
+    assert len(found[0]) == 20
+    assert found[0] == found[1]
 
 
 def test_documents_are_read_back_unchanged(store: Store):

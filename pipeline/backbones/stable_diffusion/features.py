@@ -32,6 +32,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import Dtype, NonNegative, Positive, Runtime, spec
 
 _MOST_CROPS = {"cpu": 16, "cuda": 64}
+_VAE_VALUES, _MOST_IN_VAE = 1 << 20, 4  # values of a VAE's first map, 4 MB in float32; and images, at a time on a CPU
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +157,7 @@ class DiffusionBackbone:
         return unet
 
     def _encode(self, rgb: UInt8[np.ndarray, "n S S 3"]) -> Float[Tensor, "n c h w"]:
-        # one by one on the CPU: a batch is no faster there, and the VAE's first maps are the largest of all
-        step = 1 if self.model.prompt.device.type == "cpu" else len(rgb)
+        step = _vae_pass(self.spec, self.configs) if self.model.prompt.device.type == "cpu" else len(rgb)
         images = [self._prepare_image(rgb[i : i + step]) for i in range(0, len(rgb), step)]
         return torch.cat([encode_latent(self.model.vae, self.configs.vae, image) for image in images])
 
@@ -233,12 +233,18 @@ def _bytes_per_value(spec: DiffusionFeatures) -> int:
     return 4 if spec.dtype == "float32" else 2
 
 
+def _vae_pass(spec: DiffusionFeatures, configs: DiffusionConfigs) -> int:
+    """Images that the VAE encodes at a time on the CPU: its first maps are the largest of all, and fit in the cache."""
+    values = configs.vae["block_out_channels"][0] * spec.input_size**2
+    return max(1, min(_VAE_VALUES // values, _MOST_IN_VAE))
+
+
 def _pass_footprint(spec: DiffusionFeatures, configs: DiffusionConfigs, device: str) -> Footprint:
-    """Estimate of a pass from its largest maps: the VAE's first level (one image on a CPU), the U-Net's with skips."""
+    """Estimate of a pass from its largest maps: the VAE's first level (few images on a CPU), the U-Net's with skips."""
     latent_size = spec.input_size // configs.vae_factor
     unet = 60 * configs.unet["block_out_channels"][0] * latent_size**2 * _bytes_per_value(spec)
     vae = 6 * configs.vae["block_out_channels"][0] * spec.input_size**2 * _bytes_per_value(spec)
     if device == "cuda":
         return Footprint(0, 0, unet + vae, _MOST_CROPS[device])
-    bytes_per_pass, max_batch = max(0, vae - unet), _MOST_CROPS[device]
+    bytes_per_pass, max_batch = max(0, _vae_pass(spec, configs) * vae - unet), _MOST_CROPS[device]
     return Footprint(0, bytes_per_pass, unet, max_batch, choose_cpu_pass(bytes_per_pass, unet, max_batch))

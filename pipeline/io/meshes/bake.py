@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.functional.shading import face_normals, mip_levels, texel_density, texture_colour
+from pipeline.functional.shading import Mipmap, face_normals, mip_levels, texel_density, texture_colour
 from pipeline.functional.surface import SurfacePoints, face_areas, spread_points
 from pipeline.items.objects import Mesh
 from pipeline.parallel import worker_count
@@ -136,7 +136,7 @@ def _sample_colours(mesh: Mesh, samples: SurfacePoints, spacing_mm: float) -> UI
         return np.rint(samples.interpolate(mesh.colours.astype(float), mesh.faces)).astype(np.uint8)
     density = texel_density(mesh.vertices, mesh.faces, mesh.uv, mesh.texture.shape[:2])[samples.face]
     uv = samples.interpolate(mesh.uv, mesh.faces)
-    return np.rint(texture_colour(mip_levels(mesh.texture), uv, density * spacing_mm)).astype(np.uint8)
+    return np.rint(texture_colour(Mipmap.of(mip_levels(mesh.texture)), uv, density * spacing_mm)).astype(np.uint8)
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -37,6 +37,7 @@ from pipeline.items.views import Crops
 from pipeline.spec import Positive, Runtime, digest, spec
 
 FOLDER = Path(__file__).parents[2] / "embedded" / "weights"
+_EDGES_PASS = 4  # crops whose histograms are computed at a time on a CPU: their gradients fit in its cache
 PROMPT = (1, 1, 32)  # the model was trained without text: its prompt is zeros
 
 WeightSet = Literal["learned", "pure"]
@@ -127,7 +128,10 @@ class EmbeddedBackbone(DiffusionBackbone):
     def _compute_edges(self, crops: Crops) -> Float[Tensor, "n 8 h w"]:
         device = self.model.prompt.device
         rgb, mask = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (crops.rgb, crops.mask))
-        edges = edge_histograms(rgb, mask, cells=self.spec.feature_shape(EDGES)[1])
+        step = _EDGES_PASS if device.type == "cpu" else len(rgb)
+        cells = self.spec.feature_shape(EDGES)[1]
+        parts = zip(rgb.split(step), mask.split(step), strict=True)
+        edges = torch.cat([edge_histograms(*part, cells=cells) for part in parts])
         return edges.to(getattr(torch, self.spec.dtype))
 
 

@@ -9,12 +9,12 @@ from typing import Generic, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int
 
 from pipeline.errors import BadInput
 from pipeline.functional.camera import project
 from pipeline.functional.rigid import transform
-from pipeline.functional.shading import DEFAULT_GREY, corner_normals, mip_levels, texel_density, texture_colour
+from pipeline.functional.shading import DEFAULT_GREY, Mipmap, corner_normals, mip_levels, texel_density, texture_colour
 from pipeline.items.objects import Mesh
 from pipeline.stages.render.cameras import bounding_sphere, face_vertices
 
@@ -31,6 +31,10 @@ class Hits:
     face: Int[np.ndarray, " m"]
     weight: Float32[np.ndarray, "m 3"]
     depth_mm: Float32[np.ndarray, " m"]
+
+    def __getitem__(self, part: slice) -> Hits:
+        """Some of the hits."""
+        return Hits(self.ray[part], self.direction[part], self.face[part], self.weight[part], self.depth_mm[part])
 
 
 class Caster:
@@ -72,14 +76,19 @@ class Caster:
     def covered_pixels(
         self, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"], size_hw: tuple[int, ...]
     ) -> Int[np.ndarray, "m 2"]:
-        """Pixels (x, y) that the mesh's bounding box covers; all pixels if a corner is behind the camera."""
+        """Pixels (x, y) that the mesh's bounding box covers, by rows; all pixels if a corner is behind the camera."""
         points = transform(T_cam_obj, self.box)
-        low, high = np.zeros(2), np.array([size_hw[1], size_hw[0]]) - 1.0
+        rows, last_column = np.arange(size_hw[0]), size_hw[1] - 1
+        left, right = np.zeros(len(rows), int), np.full(len(rows), last_column)
         if points[:, 2].min() > 1e-3 * self.radius:
             px = project(K, points)
-            low, high = np.maximum(low, np.floor(px.min(axis=0))), np.minimum(high, np.ceil(px.max(axis=0)))
-        columns, rows = np.arange(low[0], high[0] + 1, dtype=int), np.arange(low[1], high[1] + 1, dtype=int)
-        return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+            rows = rows[(rows >= np.floor(px[:, 1].min())) & (rows <= np.ceil(px[:, 1].max()))]
+            low, high = _row_spans(px, rows)
+            left, right = (edge.clip(-1, last_column + 1).astype(int) for edge in (np.floor(low), np.ceil(high)))
+            left, right = np.maximum(left, 0), np.minimum(right, last_column)
+        width = np.maximum(right - left + 1, 0)
+        in_row = np.arange(width.sum()) - np.repeat(np.cumsum(width) - width, width)
+        return np.stack([np.repeat(left, width) + in_row, np.repeat(rows, width)], axis=-1)
 
 
 class Surface:
@@ -87,9 +96,9 @@ class Surface:
 
     def __init__(self, mesh: Mesh, crease_deg: float) -> None:
         normals = corner_normals(mesh.vertices, mesh.faces, crease_deg=crease_deg)
-        self.levels: tuple[UInt8[np.ndarray, "h w 3"], ...] = ()
+        self.texture: Mipmap | None = None
         if mesh.texture is not None and mesh.uv is not None:
-            self.levels = mip_levels(mesh.texture)
+            self.texture = Mipmap.of(mip_levels(mesh.texture))
             self.density = texel_density(mesh.vertices, mesh.faces, mesh.uv, mesh.texture.shape[:2])
             colours = mesh.uv[mesh.faces]
         elif mesh.colours is not None:
@@ -103,12 +112,31 @@ class Surface:
         self, hits: Hits, *, footprint_mm: Float[np.ndarray, " m"]
     ) -> tuple[Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
         """Albedo (0..255) and normal (object frame, not normalised) at hits of rays that are ``footprint_mm`` wide."""
-        value = np.zeros((len(hits.face), self.corners[0].shape[1]), dtype=np.float32)
-        for corner, weight in zip(self.corners, hits.weight.T, strict=True):
-            value += corner.take(hits.face, axis=0) * weight[:, None]
-        if not self.levels:
+        value = self.corners[0].take(hits.face, axis=0) * hits.weight[:, :1]
+        for k in (1, 2):
+            value += self.corners[k].take(hits.face, axis=0) * hits.weight[:, k : k + 1]
+        if self.texture is None:
             return value[:, 3:], value[:, :3]
-        return texture_colour(self.levels, value[:, 3:], self.density.take(hits.face) * footprint_mm), value[:, :3]
+        return texture_colour(self.texture, value[:, 3:], self.density.take(hits.face) * footprint_mm), value[:, :3]
+
+
+def _row_spans(
+    px: Float[np.ndarray, "k 2"], rows: Int[np.ndarray, " h"]
+) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
+    """Where the convex hull of a few points begins and ends in each row of pixels.
+
+    The hull's edges are among the lines between any two points. Rows above or below it get the span of its nearest end.
+    """
+    first, second = np.triu_indices(len(px), 1)
+    a, step = px[first], px[second] - px[first]
+    y = rows.clip(px[:, 1].min(), px[:, 1].max())[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (y - a[:, 1]) / step[:, 1]
+    crosses = (along > -1e-9) & (along < 1 + 1e-9)
+    x = a[:, 0] + np.where(crosses, along, 0.0) * step[:, 0]
+    low, high = np.where(crosses, x, np.inf).min(axis=1), np.where(crosses, x, -np.inf).max(axis=1)
+    is_line = ~crosses.any(axis=1)  # all points in one row
+    return np.where(is_line, px[:, 0].min(), low), np.where(is_line, px[:, 0].max(), high)
 
 
 def ray_directions(

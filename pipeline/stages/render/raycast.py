@@ -15,8 +15,9 @@ from pipeline.functional.shading import shade
 from pipeline.items.objects import Mesh
 from pipeline.spec import spec
 from pipeline.stages.render.cameras import RenderSpec, subpixels
-from pipeline.stages.render.ray_mesh import Hits, Surface, get_caster, get_surface, ray_directions
+from pipeline.stages.render.ray_mesh import Caster, Hits, Surface, get_caster, get_surface, ray_directions
 
+_RAYS = 1 << 15  # rays that are cast and shaded at a time: what they take fits in the cache
 DEPTH_VERSION = 1
 """Version of ``render_depth``, on which scores and oracles depend. When depth changes, raise it and Raycast.version."""
 
@@ -51,18 +52,37 @@ class Raycast(RenderSpec):
         centre = caster.cast(K, T_cam_obj, px)
         px = px[centre.ray]
         depth_mm[px[:, 1], px[:, 0]] = centre.depth_mm
+        at_origin = ray_directions(K, T_cam_obj, np.zeros((1, 2)))
+        shifts = (ray_directions(K, T_cam_obj, subpixels(self.supersample)) - at_origin).astype(np.float32)
         footprint = 1 / (K[0, 0] * self.supersample)
-        colour, samples = self._shade(surface, centre, footprint), np.ones(len(px), dtype=np.float32)
-        if self.supersample > 1:
-            offsets = subpixels(self.supersample)
-            at_origin = ray_directions(K, T_cam_obj, np.zeros((1, 2)))
-            shifts = (ray_directions(K, T_cam_obj, offsets) - at_origin).astype(np.float32)
-            fine = caster.cast_along(T_cam_obj, (centre.direction[:, None] + shifts).reshape(-1, 3))
-            per_ray = np.zeros((len(px) * len(offsets), 3), dtype=np.float32)
-            per_ray[fine.ray] = self._shade(surface, fine, footprint)
-            colour = colour + per_ray.reshape(len(px), len(offsets), 3).sum(axis=1)
-            samples = samples + np.bincount(fine.ray // len(offsets), minlength=len(px))
-        rgb[px[:, 1], px[:, 0]] = np.rint(np.clip(colour / samples[:, None], 0, 255))
+        block = _RAYS // len(shifts)
+        for first in range(0, len(px), block):
+            x, y = px[first : first + block].T
+            colour = self._colour(caster, surface, T_cam_obj, centre[first : first + block], shifts, footprint)
+            rgb[y, x] = np.rint(np.clip(colour, 0, 255))
+
+    def _colour(
+        self,
+        caster: Caster,
+        surface: Surface,
+        T_cam_obj: Float[np.ndarray, "4 4"],
+        centre: Hits,
+        shifts: Float32[np.ndarray, "s 3"],
+        footprint: float,
+    ) -> Float32[np.ndarray, "m 3"]:
+        """Mean colour of each pixel: of the ray through its centre, and of the further rays that hit the mesh."""
+        colour = self._shade(surface, centre, footprint)
+        if self.supersample == 1:
+            return colour
+        fine = caster.cast_along(T_cam_obj, (centre.direction[:, None] + shifts).reshape(-1, 3))
+        per_ray = np.zeros((len(colour) * len(shifts), 3), dtype=np.float32)
+        per_ray[fine.ray] = self._shade(surface, fine, footprint)
+        per_pixel = per_ray.reshape(len(colour), len(shifts), 3)
+        total = per_pixel[:, 0].copy()
+        for sample in range(1, len(shifts)):  # numpy's sum over so short an axis takes several times as long
+            total += per_pixel[:, sample]
+        samples = 1 + np.bincount(fine.ray // len(shifts), minlength=len(colour)).astype(np.float32)
+        return (colour + total) / samples[:, None]
 
     def _shade(self, surface: Surface, hits: Hits, footprint: float) -> Float32[np.ndarray, "m 3"]:
         """Colour of each hit, lit from the camera; rays are ``footprint`` mm wide at a depth of 1 mm."""
