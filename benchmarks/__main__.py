@@ -14,8 +14,11 @@ import cv2
 import torch
 from threadpoolctl import threadpool_limits
 
+from benchmarks.before import compare_with_before
 from benchmarks.default_pose import default_pose
 from benchmarks.extraction import extraction, extraction_sd
+from benchmarks.growth import growth
+from benchmarks.imports import imports
 from benchmarks.jobs import memory, onboarding, warm
 from benchmarks.measure import Measurement, describe_machine, table
 from benchmarks.meshes import meshes
@@ -23,6 +26,7 @@ from benchmarks.online import online
 from benchmarks.rendering import rendering
 from benchmarks.startup import startup
 from benchmarks.storing import storing
+from benchmarks.workers import two_workers
 from pipeline.io.files import write_json
 from pipeline.parallel import use_threads
 
@@ -36,6 +40,10 @@ PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "startup": startup,
     "onboard": onboarding,
     "memory": memory,
+    "imports": imports,
+    "before": compare_with_before,
+    "workers": two_workers,
+    "growth": growth,
     "extract-sd": extraction_sd,
     "meshes": meshes,
 }
@@ -51,10 +59,13 @@ def main() -> None:
     add("--json", type=Path, default=Path("results/bench.json"), help=f"file for the measurements {default}")
     add("--device", default="cpu", help=f"cpu, cuda or cuda:N {default}")
     add("--repeats", type=int, default=7, help=f"repetitions; medians are reported {default}")
+    add("--before", default="HEAD~1", help=f"commit that the part before compares this checkout with {default}")
+    add("--lmo", type=Path, help="folder of LM-O, whose poses the part before measures (default: the demo's)")
     add("--threads", type=int, default=1, help=f"CPU threads; use 1 on a shared machine {default}")
     args = parser.parse_args()
     if unknown := sorted(set(args.parts) - set(PARTS)):
         parser.error(f"parts: found {', '.join(unknown)}, needs some of {', '.join(PARTS)}")
+    options = {"before": {"revision": args.before, "lmo": args.lmo and args.lmo.resolve()}}
     use_threads(args.threads)
     threadpool_limits(args.threads)  # of BLAS in what is measured besides: numpy, SciPy and scikit-learn
     torch.set_num_threads(args.threads)
@@ -63,7 +74,7 @@ def main() -> None:
     print(json.dumps(description), flush=True)
     measurements: list[Measurement] = []
     for name in args.parts or [part for part in PARTS if part not in ON_REQUEST]:
-        found = PARTS[name](device=args.device, repeats=args.repeats)
+        found = PARTS[name](device=args.device, repeats=args.repeats, **options.get(name, {}))
         print(f"\n{name}\n{table(found)}", flush=True)
         measurements += found
     with_target = [m for m in measurements if m.target is not None]

@@ -56,10 +56,10 @@ def write_scan(folder: Path, faces: int, suffix: str) -> Path:
     if suffix == ".ply":
         write_ply(path, replace(mesh, uv=None))
     elif suffix == ".glb":
-        rgba = np.concatenate([mesh.colours, np.full((len(mesh.vertices), 1), 255, np.uint8)], axis=-1)  # type: ignore[list-item]
-        path.write_bytes(
-            trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=rgba, process=False).export(file_type="glb")
-        )
+        rgba = np.concatenate([mesh.colours, np.full((len(mesh.vertices), 1), 255, np.uint8)], axis=-1)
+        written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=rgba, process=False).export(file_type="glb")
+        assert isinstance(written, bytes)
+        path.write_bytes(written)
     else:
         _write_obj(path, mesh)
     return path

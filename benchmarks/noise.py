@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 
 from pipeline.backbones.stable_diffusion.features import DiffusionFeatures
+from pipeline.backbones.stable_diffusion.noise import NoiseMode
 from pipeline.functional import camera, rigid
 from pipeline.functional.masks import foreground
 from pipeline.functional.similarity import l2_normalize
@@ -37,7 +38,7 @@ PAIRS = 3  # of views of an object
 TURN_DEG = 15.0
 RIGHT_CELLS = 2.0
 BACKBONES: dict[str, DiffusionFeatures] = {"embedded, pure": Embedded(weights="pure"), "random weights": RandomSD()}
-NOISES = (("shared", 1), ("independent", 1), ("independent", 4), ("none", 1))
+NOISES: tuple[tuple[NoiseMode, int], ...] = (("shared", 1), ("independent", 1), ("independent", 4), ("none", 1))
 """Kind of noise, samples averaged."""
 
 
@@ -88,11 +89,12 @@ def _turn(T_cam_obj: Float[np.ndarray, "n 4 4"], seed: int) -> Iterator[Float[np
         yield np.stack([T, T @ rigid.rigid(rigid.rotation_between(a, turned), np.zeros(3))])
 
 
-def describe(backbone: DiffusionFeatures, noise: str, ensemble: int, crops: Crops) -> list[Described]:
+def describe(backbone: DiffusionFeatures, noise: NoiseMode, ensemble: int, crops: Crops) -> list[Described]:
     """Features of all views with one kind of noise."""
     chosen = replace(backbone, noise=noise, ensemble=ensemble)
     maps = chosen.load(Runtime(device="cpu"))(crops, Pca().layers)
     seen, masks = crops.geometry, torch.from_numpy(crops.mask)
+    assert seen is not None
     features = [CropFeatures({k: m[i] for k, m in maps.items()}, mask) for i, mask in enumerate(masks)]
     return list(map(Described, features, crops.A_crop_img, seen.depth_mm, seen.K, seen.T_cam_obj))
 
