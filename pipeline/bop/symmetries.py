@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.bop.models import symmetry_transforms
-from pipeline.functional.shading import mip_levels, texel_density, texture_colour
+from pipeline.functional.shading import Mipmap, mip_levels, texel_density, texture_colour
 from pipeline.functional.surface import SurfacePoints, spread_points
 from pipeline.functional.symmetry import Surface, Symmetries, find_symmetries
 from pipeline.io.meshes import diameter_mm
@@ -36,7 +36,7 @@ def _surface_colours(mesh: Mesh, points: SurfacePoints, diameter: float) -> Floa
         density = texel_density(mesh.vertices, mesh.faces, mesh.uv, mesh.texture.shape[:2])
         texels = (density[points.face] * _FOOTPRINT * diameter).astype(np.float32)
         uv = points.interpolate(mesh.uv, mesh.faces).astype(np.float32)
-        return np.asarray(texture_colour(mip_levels(mesh.texture), uv, texels), float) / 255
+        return np.asarray(texture_colour(Mipmap.of(mip_levels(mesh.texture)), uv, texels), float) / 255
     if mesh.colours is not None:
         return points.interpolate(mesh.colours.astype(float), mesh.faces) / 255
     return None
