@@ -37,7 +37,7 @@ from pipeline.errors import BadInput, DzopError
 from pipeline.io.digests import track_files
 from pipeline.places import CONF, PACKAGE
 
-COMMANDS = ("cache", "fetch", "lint", "reproduce", "score", "symmetry")
+COMMANDS = ("cache", "doctor", "fetch", "lint", "reproduce", "score", "symmetry")
 """Commands beside a run; each is ``<name>_command`` of a module of pipeline/cli."""
 RESUME = "Completed entries are cached; rerun to resume."
 READERS = ("__main__.py", "configuration.py")  # our modules whose frames may lie between Hydra's

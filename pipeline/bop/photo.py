@@ -1,4 +1,4 @@
-"""Your own meshes, photograph, camera and optionally a mask or box -> a dataset of one image."""
+"""Your own meshes, photographs, camera and optionally masks or a box -> a dataset of one or several images."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from pipeline.bop.camera_files import NEEDED, CameraFile, estimate_camera, numbers_in, read_camera
 from pipeline.bop.given import (
     GivenObjects,
     MeshFiles,
@@ -34,18 +35,23 @@ from pipeline.errors import BadInput
 from pipeline.items.views import Detection, Image, Target
 from pipeline.spec import FaceCount, Positive, PositiveFloat, Spec, digest, spec
 
-SCENE_ID, IM_ID = 0, 0
+SCENE_ID = 0
+EXIF_WARNING = (
+    "K is a guess from the EXIF focal length, often 5 to 10 % off, and so is the distance: calibrate the camera"
+)
 
 
 @spec
 class PhotoConfig(Spec):
-    """A mesh, a photograph, K, and the object's location: a mask, a box, or neither if a detector is to find it.
+    """Meshes, photographs, K, and where the object is: masks, a box, or neither if a detector is to find it.
 
-    ``mesh``: one file, or several for a detector; they become objects 1, 2, ... in this order. ``K``: fx, fy, cx, cy
-    or the nine numbers of the matrix, row by row. ``bbox``: x, y, width, height in pixels. ``mask_label``: the
-    object's value in a mask that labels several. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres.
-    ``distortion``: k1, k2, p1, p2[, k3[, k4, k5, k6]] of OpenCV's model; the photograph, the mask and the box are
-    undistorted before anything else.
+    ``mesh``: one file, or several for a detector; they become objects 1, 2, ... in this order. ``image``: a file, a
+    pattern such as shots/*.png, or several files; photographs of one camera and size. ``K``: fx, fy, cx, cy, the nine
+    numbers of the matrix row by row, a camera file, or "exif". ``mask``: a file, a pattern or several; with several
+    photographs, masks belong to the photograph whose name theirs begins with, several to several instances.
+    ``mask_label``: the object's value, or those of its instances, in a mask that labels several. ``bbox``: x, y, width,
+    height in pixels. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres. ``distortion``: k1, k2, p1,
+    p2[, k3[, k4, k5, k6]] of OpenCV's model; photographs, masks and the box are undistorted before anything else.
     ``simplify``: most faces of a mesh, None for all. ``depth``: depth image of the photograph's size, ``depth_scale``
     mm per unit.
     """
@@ -53,11 +59,11 @@ class PhotoConfig(Spec):
     kind: ClassVar[str] = "dataset.photo"
 
     mesh: str | tuple[str, ...]
-    image: str
-    K: tuple[Any, ...]
-    mask: str | None = None
-    mask_label: Positive | None = None
-    bbox: tuple[float, ...] | None = None
+    image: str | tuple[str, ...]
+    K: Any
+    mask: str | tuple[str, ...] | None = None
+    mask_label: Positive | tuple[Positive, ...] | None = None
+    bbox: Any = None
     scale: PositiveFloat = 1.0
     distortion: tuple[Any, ...] | str | None = None
     simplify: FaceCount | None = None
@@ -67,43 +73,80 @@ class PhotoConfig(Spec):
 
     def open(self) -> Photo:
         """The dataset, checked. Raises BadInput."""
-        image = Path(self.image).expanduser()
-        size_hw = image_size(image)
-        K = parse_K(self.K, "dataset.K")
-        check_own_camera(K, size_hw, "dataset.K")
-        if self.mask is not None and self.bbox is not None:
-            raise BadInput("dataset", found="mask and bbox", needed="only one of them")
+        photos = find_files(self.image, "dataset.image")
+        size_hw = _common_size(photos)
+        camera = self._camera(photos[0], size_hw)
+        check_own_camera(camera.K, size_hw, "dataset.K")
+        masks, bbox = self._locations(photos)
         meshes = (self.mesh,) if isinstance(self.mesh, str) else self.mesh
         if not meshes or (len(meshes) > 1 and (self.mask or self.bbox)):
             found = f"{len(meshes)} meshes" + (" and the location of one object" if meshes else "")
             raise BadInput(
                 "dataset.mesh", found=found, needed="one mesh, or several without dataset.mask and dataset.bbox"
             )
-        if self.bbox is not None:
-            check_box(self.bbox, "dataset.bbox")
         if self.depth is not None:
-            self._check_depth(Path(self.depth).expanduser(), size_hw)
+            self._check_depth(Path(self.depth).expanduser(), len(photos), size_hw)
+        labels = len(self.mask_label) if isinstance(self.mask_label, tuple) else 1
+        counts = [max(1, len(found)) * labels for found in masks] or [1] * len(photos)
+        objects = range(1, len(meshes) + 1)
+        distortion = camera.distortion if self.distortion is None and camera.distortion else self.distortion
         return Photo(
             name=self.name,
-            root=image.parent,
+            root=photos[0].parent,
             split="test",
             models="",
             models_info={},
-            targets=tuple(Target(SCENE_ID, IM_ID, obj_id) for obj_id in range(1, len(meshes) + 1)),
-            photo_path=image,
+            targets=tuple(Target(SCENE_ID, n, obj_id, count) for n, count in enumerate(counts) for obj_id in objects),
+            warnings=(EXIF_WARNING,) if self.K == "exif" else (),
+            photos=photos,
             meshes=MeshFiles(tuple(Path(mesh).expanduser() for mesh in meshes), self.scale, self.simplify),
-            camera_matrix=K,
+            camera_matrix=camera.K,
             mask_label=self.mask_label,
-            mask_file=None if self.mask is None else Path(self.mask).expanduser(),
-            bbox_xyxy=None if self.bbox is None else xyxy_from_xywh(self.bbox),
-            lens=None if self.distortion is None else parse_lens(self.distortion, K, size_hw),
+            masks=masks,
+            bbox_xyxy=bbox,
+            lens=None if distortion is None else parse_lens(distortion, camera.K, size_hw),
             simplify=self.simplify,
             depth_file=None if self.depth is None else Path(self.depth).expanduser(),
             depth_scale=self.depth_scale,
         )
 
-    def _check_depth(self, path: Path, size_hw: tuple[int, int]) -> None:
+    def _camera(self, photo: Path, size_hw: tuple[int, int]) -> CameraFile:
+        """K with whatever else the camera's file states. Raises BadInput."""
+        given = self.K
+        if isinstance(given, str) and (numbers := numbers_in(given)) is not None:
+            given = tuple(numbers)
+        if isinstance(given, tuple):
+            return CameraFile(parse_K(given, "dataset.K"))
+        if given == "exif":
+            return estimate_camera(photo, size_hw)
+        if not isinstance(given, str):
+            raise BadInput("dataset.K", found=repr(given), needed=NEEDED)
+        path = Path(given).expanduser()
+        if path.suffix.lower() not in (".yaml", ".yml", ".json"):
+            raise BadInput("dataset.K", found=repr(given), needed=NEEDED)
+        camera = read_camera(path)
+        camera.check_size(size_hw, str(path))
+        return camera
+
+    def _locations(self, photos: tuple[Path, ...]) -> tuple[tuple[tuple[Path, ...], ...], Box | None]:
+        """The masks of every photograph, and the box. Raises BadInput."""
+        if self.mask is not None and self.bbox is not None:
+            raise BadInput("dataset", found="mask and bbox", needed="only one of them")
+        if self.bbox is not None:
+            numbers = numbers_in(self.bbox) if isinstance(self.bbox, str) else self.bbox
+            if not isinstance(numbers, (tuple, list)) or any(isinstance(n, (str, bool)) for n in numbers):
+                raise BadInput("dataset.bbox", found=repr(self.bbox), needed="[x,y,width,height]")
+            check_box(numbers, "dataset.bbox")
+            if len(photos) > 1:
+                found = f"one box for {len(photos)} photographs"
+                raise BadInput("dataset.bbox", found=found, needed="dataset.mask, one for each photograph")
+            return (), xyxy_from_xywh(numbers)
+        return ((), None) if self.mask is None else (_pair_masks(find_files(self.mask, "dataset.mask"), photos), None)
+
+    def _check_depth(self, path: Path, photos: int, size_hw: tuple[int, int]) -> None:
         """Raise BadInput for a depth image of another size, and for one of a photograph with distortion."""
+        if photos > 1:
+            raise BadInput("dataset.depth", found=f"one depth image for {photos} photographs", needed="one photograph")
         (h, w), found = size_hw, image_size(path)
         if found != size_hw:
             needed = f"those of the photograph, {w} x {h} (width x height): register depth to colour first"
@@ -112,14 +155,57 @@ class PhotoConfig(Spec):
             raise BadInput("dataset.depth", found="with dataset.distortion", needed="an undistorted pair of images")
 
 
+def find_files(given: str | tuple[str, ...], where: str) -> tuple[Path, ...]:
+    """Files of a name, of a pattern with * or ?, or of several of both, sorted by name. Raises BadInput for none."""
+    found: list[Path] = []
+    for name in (given,) if isinstance(given, str) else given:
+        path = Path(name).expanduser()
+        if path.exists() or not set("*?") & set(name):
+            found.append(path)
+            continue
+        anchor = Path(path.anchor)
+        matching = sorted(match for match in anchor.glob(str(path.relative_to(anchor))) if match.is_file())
+        if not matching:
+            raise BadInput(where, found=f"no file that matches {name}", needed="at least one")
+        found += matching
+    if not found:
+        raise BadInput(where, found="an empty list", needed="at least one file")
+    return tuple(dict.fromkeys(found))
+
+
+def _common_size(photos: tuple[Path, ...]) -> tuple[int, int]:
+    """(h, w) of the photographs. Raises BadInput for two sizes, which no K fits."""
+    sizes = {path: image_size(path) for path in photos}
+    first = sizes[photos[0]]
+    for path, size_hw in sizes.items():
+        if size_hw != first:
+            needed = f"those of {photos[0].name}, {first[1]} x {first[0]} (width x height): one K belongs to one size"
+            raise BadInput(path, found=f"{size_hw[1]} x {size_hw[0]} pixels", needed=needed)
+    return first
+
+
+def _pair_masks(masks: tuple[Path, ...], photos: tuple[Path, ...]) -> tuple[tuple[Path, ...], ...]:
+    """The masks of every photograph: those whose names begin with its name. Raises BadInput."""
+    if len(photos) == 1:
+        return (masks,)
+    stems = sorted((photo.stem for photo in photos), key=len, reverse=True)
+    owner = {mask: next((s for s in stems if mask.stem == s or mask.stem.startswith(f"{s}_")), None) for mask in masks}
+    paired = tuple(tuple(mask for mask in masks if owner[mask] == photo.stem) for photo in photos)
+    for photo, own in zip(photos, paired, strict=True):
+        if not own:
+            found = f"no mask of {photo.name} among {len(masks)}"
+            raise BadInput("dataset.mask", found=found, needed=f"one named {photo.stem}.png or {photo.stem}_*.png")
+    return paired
+
+
 @dataclass(frozen=True, eq=False)
 class Photo(GivenObjects):
-    """A dataset of one image, without ground truth."""
+    """A dataset of photographs of one camera, without ground truth. ``masks``: of every photograph, or empty."""
 
-    photo_path: Path = Path()
+    photos: tuple[Path, ...] = ()
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    mask_file: Path | None = None
-    mask_label: int | None = None
+    masks: tuple[tuple[Path, ...], ...] = ()
+    mask_label: int | tuple[int, ...] | None = None
     bbox_xyxy: Box | None = None
     lens: Lens | None = None
     depth_file: Path | None = None
@@ -147,7 +233,7 @@ class Photo(GivenObjects):
     @property
     def location_field(self) -> str:
         """``dataset.mask`` or ``dataset.bbox``, "" without either."""
-        return "dataset.mask" if self.mask_file else "dataset.bbox" if self.bbox_xyxy else ""
+        return "dataset.mask" if self.masks else "dataset.bbox" if self.bbox_xyxy else ""
 
     @property
     def given_bbox_xyxy(self) -> Box | None:
@@ -157,7 +243,7 @@ class Photo(GivenObjects):
     @property
     def given_location(self) -> list[Any]:
         """Label of the mask and lens, where they are given."""
-        given = [] if self.mask_label is None else [self.mask_label]
+        given: list[Any] = [] if self.mask_label is None else [self.mask_label]
         return given if self.lens is None else [*given, self.lens.identity()]
 
     @property
@@ -167,19 +253,21 @@ class Photo(GivenObjects):
 
     def image(self, scene_id: int, im_id: int) -> Image:
         """The photograph, without the lens's distortion if that is given."""
-        rgb = read_rgb(self.photo_path)
+        rgb = read_rgb(self.photos[im_id])
         return Image(scene_id, im_id, rgb if self.lens is None else self.lens.undistort(rgb), self.camera_matrix)
 
     def image_digest(self, scene_id: int, im_id: int) -> str:
         """Digest of the photograph as ``image`` returns it."""
-        content = image_digest(self.photo_path)
+        content = image_digest(self.photos[im_id])
         return content if self.lens is None else digest([content, self.lens.identity()])
 
-    def object_mask(self, path: Path, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    def object_mask(
+        self, path: Path, size_hw: tuple[int, int], *, im_id: int = 0, label: int | None = None
+    ) -> Bool[np.ndarray, "H W"]:
         """The mask in a file, without the lens's distortion if that is given. Raises BadInput for another size."""
-        mask, (h, w) = read_mask(path, label=self.mask_label), size_hw
+        mask, (h, w) = read_mask(path, label=label), size_hw
         if mask.shape != size_hw:
-            turned = mask.shape == (w, h) and read_orientation(self.photo_path) in QUARTER_TURNS
+            turned = mask.shape == (w, h) and read_orientation(self.photos[im_id]) in QUARTER_TURNS
             found = f"{mask.shape[1]} x {mask.shape[0]} pixels"
             cause = "; EXIF turns the photograph upright, and not the mask" if turned else ""
             raise BadInput(path, found=found, needed=f"those of the photograph, {w} x {h} (width x height){cause}")
@@ -187,11 +275,11 @@ class Photo(GivenObjects):
 
     def image_name(self, scene_id: int, im_id: int) -> str:
         """Name of the photograph's file."""
-        return self.photo_path.name
+        return self.photos[im_id].name
 
     def image_path(self, scene_id: int, im_id: int) -> Path:
         """The photograph's file."""
-        return self.photo_path
+        return self.photos[im_id]
 
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
         """The photograph's camera matrix, px."""
@@ -199,17 +287,22 @@ class Photo(GivenObjects):
 
     @property
     def location_files(self) -> list[Path]:
-        """The photograph, and its mask file if given."""
-        return [self.photo_path] + ([] if self.mask_file is None else [self.mask_file])
+        """The photographs, and their masks if given."""
+        return [*self.photos, *(mask for masks in self.masks for mask in masks)]
 
     def locate(self, target: Target) -> list[Detection]:
-        """The detection of the mask or box. Raises BadInput for one that does not fit the photograph, and for none."""
-        if self.mask_file is None and self.bbox_xyxy is None:
+        """Detections of the masks or the box. Raises BadInput for what does not fit the photograph, and for none."""
+        if not self.masks and self.bbox_xyxy is None:
             needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=cnos, which finds the object"
             raise BadInput("dataset", found="neither of mask and bbox", needed=needed)
         size_hw = self.image_size(target.scene_id, target.im_id)
-        if self.mask_file is not None:
-            return [detect_mask(target, self.object_mask(self.mask_file, size_hw), self.mask_file)]
+        if self.masks:
+            labels = self.mask_label if isinstance(self.mask_label, tuple) else (self.mask_label,)
+            return [
+                detect_mask(target, self.object_mask(path, size_hw, im_id=target.im_id, label=label), path)
+                for path in self.masks[target.im_id]
+                for label in labels
+            ]
         box = self.bbox_xyxy or (0.0,) * 4
         check_box_in_image(box, size_hw, "dataset.bbox")
         return [detect_box(target, box if self.lens is None else self.lens.undistort_box(box, "dataset.bbox"))]

@@ -93,3 +93,9 @@ def _distance_to_segments(
     square = np.maximum((along**2).sum(axis=-1), 1e-300)
     t = np.clip(((p - start) * along).sum(axis=-1) / square, 0, 1)
     return np.linalg.norm(p - start - t[..., None] * along, axis=-1)
+
+
+def signed_volume(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
+    """Volume inside a closed surface; negative where its faces are turned inside out. Holes change it little."""
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)

@@ -55,7 +55,7 @@ class Photographs:
             by_image[answer.scene_id, answer.im_id].append(index)
         data, folders = self.folder.context.dataset, []
         for image, indices in by_image.items():
-            folder = self.folder.out / _folder_name(data.image_name(*image))
+            folder = self.folder.out / self._folder_name(image)
             more = {"run": str(self.folder.path), "made_from": f"{FILES_VERSION} {self.pictures.made_from}"}
             wanted = ["pose.json", *(["overlay.jpg", "pose.html"] if overlays else [])]
             if not _holds(folder, wanted, more["made_from"]):
@@ -84,13 +84,16 @@ class Photographs:
                 lines.append(f"  {result.inliers} of {result.correspondences} matches agree{result.details()}")
         return "\n".join(lines)
 
+    def _folder_name(self, image: ImageId) -> str:
+        """The photograph's name without its suffix; with a number where another one has the same."""
+        data = self.folder.context.dataset
+        names = {other: Path(data.image_name(*other)).stem.lstrip(".") for other in self.folder.context.image_ids}
+        name = names[image] or "photograph"
+        is_taken = name in RESERVED or list(names.values()).count(name) > 1
+        return f"{name}_{image[1]}" if is_taken else name
+
     def _cards(self, indices: Sequence[int]) -> Cards:
         return [self.pictures.draw_card(index) for index in indices]
-
-
-def _folder_name(image_name: str) -> str:
-    name = Path(image_name).stem.lstrip(".") or "photograph"
-    return f"{name}_" if name in RESERVED else name
 
 
 def _holds(folder: Path, names: Sequence[str], made_from: str) -> bool:
