@@ -21,8 +21,8 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 from jaxtyping import Bool, Float
 from omegaconf import OmegaConf
-from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import roc_auc_score
+from scipy.optimize import minimize
+from scipy.special import expit
 
 from benchmarks.accuracy import path_override
 from benchmarks.run_pool import run_all
@@ -35,6 +35,7 @@ from pipeline.io.files import write_json
 from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import answer_from_record
 from pipeline.metrics.pose_error import hull_vertices, mssd
+from pipeline.metrics.reliability import calibration_error, ranking_auc
 
 FIT_SEEDS, TEST_SEEDS = (11,), (12,)
 OBJECTS, IMAGES = 10, 48
@@ -45,31 +46,26 @@ PRECISION = 0.95
 """Share of accepted poses that are right, from which the threshold of "accept" follows."""
 REJECT_BELOW = 0.2
 TERMS = (
-    ("inliers", "log"),
-    ("inlier_ratio", "linear"),
-    ("inlier_ratio", "square"),
-    ("similarity", "linear"),
-    ("value", "log"),
-    ("cosine", "linear"),
-    ("coverage", "linear"),
-    ("agreeing", "linear"),
-    ("agreeing * agreeing", "linear"),
-    ("rival", "linear"),
-    ("rival", "square"),
-    ("template_score", "linear"),
-    ("template_margin", "log"),
-    ("overlap", "linear"),
-    ("explained", "linear"),
-    ("visible", "linear"),
-    ("moved", "log"),
-    ("reprojection", "log"),
-    ("crop_px", "log"),
-    ("mask_share", "linear"),
-    ("cosine * coverage", "linear"),
-    ("cosine * inlier_ratio", "linear"),
-    ("agreeing * cosine", "linear"),
+    ("inliers", "log", 1),
+    ("inlier_ratio", "linear", 1),
+    ("reprojection", "log", -1),
+    ("similarity", "linear", 1),
+    ("value", "log", 1),
+    ("cosine", "linear", 1),
+    ("coverage", "linear", 1),
+    ("agreeing", "linear", 1),
+    ("rival", "linear", -1),
+    ("overlap", "linear", 1),
+    ("explained", "linear", 1),
+    ("visible", "linear", 1),
+    ("moved", "log", -1),
+    ("template_score", "linear", 1),
+    ("template_margin", "log", 1),
+    ("crop_px", "log", 1),
 )
-"""Evidence that the model sums, each with its transform."""
+"""Evidence, its transform, and whether more of it speaks for the pose (1) or against it (-1)."""
+STRENGTH = 0.3
+"""Of the fit's freedom, as C of scikit-learn's LogisticRegression; chosen by cross-validation over objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,23 +119,18 @@ def _measure(root: Path, records: Sequence[Mapping[str, Any]]) -> list[Example]:
 def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[str, str], command: str) -> Calibration:
     """The calibration of a method from its poses."""
     available = {name for example in examples for name in example.estimate.evidence}
-    terms = [Term(n, t, 0.0, 1.0, 0.0, 0.0) for n, t in TERMS if set(n.split(" * ")) <= available]
-    terms = [_standardise(term, examples) for term in terms]
-    x, weights, biases = _values(terms, examples), [], []
-    for limit in LIMITS:
-        model = LogisticRegression(C=0.1, max_iter=2000).fit(x, [e.error < limit for e in examples])
-        weights.append(model.coef_[0])
-        biases.append(float(model.intercept_[0]))
-    fitted = [
-        replace(term, weight_20=round(float(a), 5), weight_10=round(float(b), 5))
-        for term, a, b in zip(terms, *weights, strict=True)
-    ]
+    chosen = [(name, transform, sign) for name, transform, sign in TERMS if name in available]
+    terms = [_standardise(Term(name, transform, 0.0, 1.0, 0.0, 0.0), examples) for name, transform, _ in chosen]
+    x, signs = _values(terms, examples), [sign for *_, sign in chosen]
+    (bias_20, *w_20), (bias_10, *w_10) = (fit_signed(x, right(examples, limit), signs) for limit in LIMITS)
+    weights = zip(terms, w_20, w_10, strict=True)
+    fitted = [replace(term, weight_20=round(float(a), 5), weight_10=round(float(b), 5)) for term, a, b in weights]
     calibration = Calibration(
         kinds=kinds,
         recipes=recipes,
         terms=tuple(fitted),
-        bias_20=round(biases[0], 5),
-        bias_10=round(biases[1], 5),
+        bias_20=round(float(bias_20), 5),
+        bias_10=round(float(bias_10), 5),
         accept=1.0,
         reject=REJECT_BELOW,
         rival_power=4.0,
@@ -150,12 +141,28 @@ def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[
     return replace(calibration, accept=_accept_from(confidences(calibration, examples), right(examples)))
 
 
+def fit_signed(
+    x: Float[np.ndarray, "n k"], correct: Bool[np.ndarray, " n"], signs: Sequence[int]
+) -> Float[np.ndarray, " k+1"]:
+    """Bias and weights of a logistic regression whose weights have the given signs or are 0.
+
+    A weight of the other sign would only say how the scenes of the fit differ from others.
+    """
+    y = np.where(correct, 1.0, -1.0)
+
+    def loss(w: Float[np.ndarray, " k+1"]) -> tuple[float, Float[np.ndarray, " k+1"]]:
+        z = y * (x @ w[1:] + w[0])
+        pull = -y * expit(-z)
+        value = np.logaddexp(0, -z).sum() + 0.5 / STRENGTH * (w[1:] ** 2).sum()
+        return float(value), np.concatenate([[pull.sum()], x.T @ pull + w[1:] / STRENGTH])
+
+    bounds = [(None, None), *((0, None) if sign > 0 else (None, 0) for sign in signs)]
+    found = minimize(loss, np.zeros(x.shape[1] + 1), jac=True, bounds=bounds, method="L-BFGS-B")
+    return np.asarray(found.x)
+
+
 def _standardise(term: Term, examples: Sequence[Example]) -> Term:
-    parts = term.name.split(" * ")
-    complete = [e for e in examples if set(parts) <= e.estimate.evidence.keys()]
-    raw = np.array([term.value(e.estimate.evidence) for e in complete])
-    wide = replace(term, scale=1e3)  # nothing is clipped
-    raw = 1e3 * np.array([wide.value(e.estimate.evidence) for e in complete])
+    raw = np.array([term.value(e.estimate.evidence) for e in examples if term.name in e.estimate.evidence])
     return replace(term, mean=round(float(raw.mean()), 6), scale=round(float(max(raw.std(), 1e-6)), 6))
 
 
@@ -188,13 +195,6 @@ def confidences(calibration: Calibration, examples: Sequence[Example]) -> Float[
     return np.array([calibration.apply(e.estimate).confidence or 0.0 for e in examples])
 
 
-def calibration_error(confidence: Float[np.ndarray, " n"], correct: Bool[np.ndarray, " n"], *, bins: int = 10) -> float:
-    """ECE: mean distance between confidence and share of right poses, over bins of equal width, weighted by size."""
-    index = np.minimum((confidence * bins).astype(int), bins - 1)
-    parts = [(index == b) for b in range(bins)]
-    return float(sum(abs(confidence[p].mean() - correct[p].mean()) * p.mean() for p in parts if p.any()))
-
-
 def measure(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], accept: float) -> dict[str, float]:
     """AUC of all poses and of those of the right mesh, calibration error, and what is accepted."""
     correct, true_mesh = right(examples), np.array([e.case.T_cam_obj is not None for e in examples])
@@ -203,9 +203,9 @@ def measure(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], ac
     found = {
         "poses": float(len(examples)),
         "right": float(correct.mean()),
-        "AUC": float(roc_auc_score(correct, confidence)),
-        "AUC of the right mesh": float(roc_auc_score(correct[true_mesh], confidence[true_mesh])),
-        "AUC of the former score": float(roc_auc_score(correct, old)),
+        "AUC": ranking_auc(confidence, correct),
+        "AUC of the right mesh": ranking_auc(confidence[true_mesh], correct[true_mesh]),
+        "AUC of the former score": ranking_auc(old, correct),
         "calibration error": calibration_error(confidence, correct),
         "accepted": float(chosen.mean()),
         "right among accepted": float(correct[chosen].mean()) if chosen.any() else 1.0,

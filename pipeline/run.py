@@ -22,12 +22,13 @@ from pipeline.io.digests import DigestCache, track_files
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.method import Stages
+from pipeline.metrics.reliability import calibration_error, ranking_auc
 from pipeline.options import Options
 from pipeline.outputs.files import errors_by_answer, places_text, write_computed_detections, write_files
 from pipeline.outputs.folder import OutputFolder
 from pipeline.outputs.photographs import Photographs
 from pipeline.outputs.pictures import Pictures
-from pipeline.outputs.records import digest_answers, write_record
+from pipeline.outputs.records import confidences_of, digest_answers, write_record
 from pipeline.parallel import use_threads
 from pipeline.progress import Progress
 from pipeline.report.run_records import read_run_records
@@ -237,6 +238,10 @@ def _print_results(
         return
     print(f"\nscores on {context.stages.detect.summary}")
     print(scores_table(evaluation.scored, theta_max=options.evaluate.theta_max).lstrip("\n"))
+    if found := confidences_of(answers, evaluation):
+        confidence, right = np.array([c for c, _ in found]), np.array([r for _, r in found])
+        error, auc = calibration_error(confidence, right), ranking_auc(confidence, right)
+        print(f"confidence: AUC {auc:.3f}, calibration error {error:.1%}")
     if evaluation.correspondences:
         median = np.median(list(evaluation.correspondences.values()))
         print(f"correspondences: median error {median:.1%} of the diameter, parallel to the image plane")

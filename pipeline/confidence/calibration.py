@@ -29,7 +29,6 @@ CALIBRATED_STAGES = ("extract", "crop", "match", "fuse", "cluster", "correspond"
 _TRANSFORMS: Mapping[str, Callable[[float], float]] = {
     "linear": float,
     "log": lambda value: math.log(max(value, 1e-3)),
-    "square": lambda value: value * value,
 }
 
 
@@ -37,7 +36,7 @@ _TRANSFORMS: Mapping[str, Callable[[float], float]] = {
 class Term:
     """A summand of the model: (transform(evidence[name]) - mean) / scale, times a weight for each threshold.
 
-    ``name`` may be a product of two, as "cosine * coverage". Missing evidence counts as its mean.
+    Missing evidence counts as its mean.
     """
 
     name: str
@@ -48,12 +47,10 @@ class Term:
     weight_10: float
 
     def value(self, evidence: Mapping[str, float]) -> float:
-        """The standardised value; 0 where a part is missing."""
-        parts = [evidence.get(part) for part in self.name.split(" * ")]
-        if any(part is None for part in parts):
+        """The standardised value; 0 where it is missing."""
+        if self.name not in evidence:
             return 0.0
-        product = math.prod(float(part) for part in parts if part is not None)
-        return float(np.clip((_TRANSFORMS[self.transform](product) - self.mean) / self.scale, -6.0, 6.0))
+        return (_TRANSFORMS[self.transform](evidence[self.name]) - self.mean) / self.scale
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pipeline.graph import PoseEvaluation
 from pipeline.items.errors import TemplateError
 from pipeline.items.poses import NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_to_record
+from pipeline.metrics.reliability import RIGHT
 from pipeline.metrics.template_error import ACC_DEG
 from pipeline.outputs.folder import OutputFolder
 from pipeline.report.run_records import Case, RunRecord, finished_run_record, run_id, write_run_record
@@ -87,6 +88,16 @@ def _make_record(
         templates=evaluation.templates,
         cases=tuple(cases),
         machines=tuple(folder.graph.machines()),
+        confidences=confidences_of(answers, evaluation),
+    )
+
+
+def confidences_of(answers: Sequence[Answer], evaluation: PoseEvaluation) -> tuple[tuple[float, bool], ...]:
+    """Confidence of each pose of an annotated instance, and whether the pose is right; none without a calibration."""
+    return tuple(
+        (answer.confidence, errors.mssd_mm < RIGHT * errors.diameter_mm)
+        for answer, errors in zip(answers, evaluation.by_answer, strict=True)
+        if isinstance(answer, PoseEstimate) and answer.confidence is not None and errors is not None
     )
 
 

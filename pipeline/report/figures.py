@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 
 from pipeline.items.scores import Scores
 from pipeline.metrics.recall import MSPD_PX, THETAS, recall_by_threshold, recall_by_visibility
+from pipeline.metrics.reliability import calibration_error, ranking_auc, reliability_bins
 from pipeline.report import published
 from pipeline.report.families import Family
 from pipeline.report.names import AXIS_TITLES, detections_text, value_text
@@ -153,6 +154,25 @@ def visibility_figure(run: RunRecord) -> Figure | None:
     axes.set(xlabel="visible part of the instance, %", ylabel="average recall", ylim=(0, 1.02))
     add_legend(axes)
     return Figure("visibility", "Average recalls by visible part of the instance.", canvas)
+
+
+@mpl.rc_context(STYLE)
+def reliability_figure(run: RunRecord) -> Figure | None:
+    """Share of right poses by confidence; None for a run whose poses have none."""
+    if not run.confidences:
+        return None
+    confidence, right = np.array([c for c, _ in run.confidences]), np.array([r for _, r in run.confidences])
+    bins, (canvas, axes) = reliability_bins(confidence, right), one_panel()
+    axes.plot([0, 1], [0, 1], "--", color=GREY, label="calibrated")
+    x, y = [b.confidence for b in bins], [b.right for b in bins]
+    axes.plot(x, y, "o-", color=METRIC_COLOURS["mssd"], label="measured")
+    for b in bins:
+        axes.annotate(str(b.count), (b.confidence, b.right), (0, 6), textcoords="offset points", ha="center")
+    axes.set(xlabel="confidence", ylabel="share of right poses", xlim=(0, 1.02), ylim=(0, 1.08))
+    add_legend(axes)
+    error, auc = calibration_error(confidence, right), ranking_auc(confidence, right)
+    caption = f"Confidence and truth, with numbers of poses: AUC {auc:.2f}, calibration error {error:.1%}."
+    return Figure("reliability", caption, canvas)
 
 
 @mpl.rc_context(STYLE)

@@ -58,8 +58,9 @@ class RunRecord:
     many items were computed and reused, and seconds. ``times_s``: by stage, median seconds of a target. ``failures``:
     (stage, reason, count) of targets without a pose. ``templates``: errors of the matched templates by (scene_id,
     im_id, obj_id, gt_id). ``metrics``: average recalls and other summary figures. ``folder``: where csv, poses.json and
-    pictures are, relative to ``out``. ``machines``: what computed the entries it used, one line each. A failed run has
-    ``error`` and its command-line ``overrides``, and defaults for everything it did not reach.
+    pictures are, relative to ``out``. ``machines``: what computed the entries it used, one line each.
+    ``confidences``: confidence of each scored pose, and whether its MSSD is below 20 % of the diameter. A failed run
+    has ``error`` and its command-line ``overrides``, and defaults for everything it did not reach.
     """
 
     id: str
@@ -88,6 +89,7 @@ class RunRecord:
     templates: Mapping[tuple[int, int, int, int], TemplateError] = field(default_factory=dict)
     cases: tuple[Case, ...] = ()
     machines: tuple[str, ...] = ()
+    confidences: tuple[tuple[float, bool], ...] = ()
 
     def require_scores(self) -> Scores:
         """The scores of a run that was evaluated."""
@@ -245,6 +247,7 @@ def _from_json(content: dict[str, Any]) -> RunRecord:
     templates = {(s, i, o, g): TemplateError(*angles) for s, i, o, g, *angles in content.pop("templates")}
     content["overrides"] = tuple(content["overrides"])
     content["machines"] = tuple(content.get("machines", ()))
+    content["confidences"] = tuple((float(value), bool(right)) for value, right in content.get("confidences", ()))
     failures = tuple((stage, reason, count) for stage, reason, count in content.pop("failures"))
     return RunRecord(
         **content,

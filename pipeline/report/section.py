@@ -138,6 +138,7 @@ class Section:
             figures.theta_figure(shown, self.dataset),
             figures.thresholds_figure(self.base),
             figures.visibility_figure(self.base),
+            figures.reliability_figure(self.base),
         ]
         return [figure for figure in made if figure is not None]
 

@@ -17,7 +17,7 @@ from pipeline.errors import BadInput
 from pipeline.items.poses import Alternative, PoseEstimate
 
 EYE = np.eye(4)
-TERMS = (Term("inliers", "log", 5.0, 1.0, 2.0, 1.0), Term("cosine * coverage", "linear", 0.5, 0.1, 1.0, 1.0))
+TERMS = (Term("inliers", "log", 5.0, 1.0, 2.0, 1.0), Term("cosine", "linear", 0.5, 0.1, 1.0, 1.0))
 
 
 def calibration(**changed) -> Calibration:
@@ -44,8 +44,8 @@ def stages_of(*overrides: str):
 
 
 def test_confidence_is_the_logistic_sum_of_the_evidence():
-    found = calibration().apply(estimate({"inliers": np.exp(6.0), "cosine": 0.9, "coverage": 0.7}))
-    total = 2.0 * 1.0 + 1.0 * (0.9 * 0.7 - 0.5) / 0.1
+    found = calibration().apply(estimate({"inliers": np.exp(6.0), "cosine": 0.63}))
+    total = 2.0 * 1.0 + 1.0 * (0.63 - 0.5) / 0.1
     assert found.confidence == pytest.approx(1 / (1 + np.exp(-total)))
     assert found.score == found.confidence
     assert found.confidence_10 == pytest.approx(1 / (1 + np.exp(-(total - 1.0 - 1.0))))

@@ -79,3 +79,11 @@ def test_long_names_leave_room_for_the_axes():
         warnings.simplefilter("error")  # matplotlib gives up its layout with a warning
         for figure in drawn:
             figure.canvas.draw_without_rendering()
+
+
+def test_reliability_is_drawn_for_runs_whose_poses_have_a_confidence():
+    assert figures.reliability_figure(toy_run()) is None
+    pairs = tuple((0.9, k < 9) for k in range(10)) + tuple((0.3, k < 3) for k in range(10))
+    drawn = figures.reliability_figure(replace(toy_run(), confidences=pairs))
+    assert "AUC 0.81, calibration error 0.0%" in drawn.caption
+    assert [text.get_text() for text in drawn.canvas.axes[0].texts] == ["10", "10"]
