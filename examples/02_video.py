@@ -1,0 +1,39 @@
+"""The pose of one object in every frame of a video: the templates stay in memory, and every frame is one call."""
+
+import argparse
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+
+from pipeline import PoseEstimator
+from pipeline.bop.camera_files import read_camera
+
+
+def main() -> None:
+    """Print one line of CSV per frame: its name, the translation in mm, the quaternion and the score."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("mesh", help="the mesh in millimetres")
+    parser.add_argument("frames", type=Path, help="folder of images")
+    parser.add_argument("masks", type=Path, help="folder of masks with the names of the images")
+    parser.add_argument("camera", type=Path, help="camera file of ROS or OpenCV, without distortion")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings as on the command line")
+    given = parser.parse_args()
+    K = read_camera(given.camera).K
+    rows = csv.writer(sys.stdout)
+    rows.writerow(["frame", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "score"])
+    with PoseEstimator.from_mesh(given.mesh, settings=given.set) as estimator:
+        for path in sorted(given.frames.glob("*.png")):
+            rgb = np.asarray(PIL.Image.open(path).convert("RGB"))
+            result = estimator(rgb, K, mask=np.asarray(PIL.Image.open(given.masks / path.name)))
+            if result.T_cam_obj is None or result.quaternion_xyzw is None:
+                print(f"{path.name}: {result.reason}", file=sys.stderr)
+                continue
+            numbers = [*result.T_cam_obj[:3, 3], *result.quaternion_xyzw, result.score]
+            rows.writerow([path.name, *(f"{number:.5g}" for number in numbers)])
+
+
+if __name__ == "__main__":
+    main()
