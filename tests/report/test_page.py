@@ -2,6 +2,7 @@ import errno
 import re
 import shutil
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,17 @@ def page(runs, out) -> str:
 @pytest.fixture(scope="module")
 def runs():
     return [toy_run(0.5), *(toy_run(0.3 + n / 1000, at=n // 10, cluster__count=n) for n in (40, 80, 130)), failed_run()]
+
+
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """Figures without lines, for tests of what else is on a page or of its files: drawing takes seconds."""
+
+    def savefig(canvas, to, **_) -> None:
+        with open(to, "w") if isinstance(to, str) else nullcontext(to) as file:
+            file.write("<svg></svg>")
+
+    monkeypatch.setattr("pipeline.report.plotting.Canvas.savefig", savefig)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +193,7 @@ def test_a_page_is_made_from_records_on_disk(runs, tmp_path):
         read_run_records(tmp_path / "empty")
 
 
-def test_files_of_removed_runs_are_deleted_with_the_old_page(runs, tmp_path):
+def test_files_of_removed_runs_are_deleted_with_the_old_page(runs, tmp_path, blank_figures):
     page(runs, tmp_path)
     drawn = {path.name for path in (tmp_path / "report").rglob("ablation_cluster_count.*")}
     assert {"ablation_cluster_count.csv", "ablation_cluster_count.tex"} <= drawn
@@ -215,8 +227,7 @@ def fail_at(monkeypatch: pytest.MonkeyPatch, number: int) -> list[str]:
     return writes
 
 
-@pytest.mark.slow
-def test_a_full_disk_leaves_the_report_that_was_there(runs, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_report_that_was_there(runs, tmp_path, monkeypatch, blank_figures):
     page(runs[:2], tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with monkeypatch.context() as patch:
@@ -267,7 +278,7 @@ def test_detections_are_named_also_for_records_of_earlier_versions(tmp_path, det
     assert ("Ground truth tells the method" in text) == ("(oracle)" in shown)
 
 
-def test_an_ablation_that_changed_no_answer_says_so(tmp_path):
+def test_an_ablation_that_changed_no_answer_says_so(tmp_path, blank_figures):
     flat = [toy_run(0.5), *(toy_run(0.5, at=n, correspond__per_cluster=n) for n in (1, 5, 30))]
     note = "correspond.per_cluster changed no answer: all 4 runs gave the same poses and scores."
     assert note in page(flat, tmp_path / "flat")
