@@ -6,10 +6,22 @@ import signal
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 from pipeline.__main__ import main
+
+TOY = (
+    "dataset=bop", "dataset.name=toy", "method=dzop", "extract=pixels", "render.size=96", "overlays=false",
+    "gallery=0", "threads=1", "runtime.progress=false", "evaluate.vsd=false",
+)  # fmt: skip
+
+
+def toy_arguments(scene: Path, folder: Path, *overrides: str) -> list[str]:
+    """A quick run on the fixture ``scene``, with store and results below ``folder``."""
+    places = (f"dataset.root={scene}", f"store.root={folder}/cache", f"out={folder}/results")
+    return [*TOY, *places, *overrides]
 
 
 @dataclass(frozen=True)
@@ -60,6 +72,7 @@ def _result(status: int | str | None, out: str, err: str) -> CommandResult:
     return CommandResult(1, out, err + status) if isinstance(status, str) else CommandResult(status, out, err)
 
 
-def restore_ctrl_c() -> None:
-    """Let a child process react to SIGINT (``preexec_fn``): below a shell's background job it would ignore it."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def restore_signals() -> None:
+    """Let a child process react to Ctrl-C and SIGHUP (``preexec_fn``): below ``&`` or nohup it would ignore them."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)

@@ -64,6 +64,16 @@ def bop_reference() -> Path:
     return _existing(TEST_DATA.parent / "reference" / "bop_metrics")
 
 
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A procedural dataset in BOP format: two images of two objects, 320 x 240 px. Tests change only copies of it."""
+    from pipeline.synthetic.scenes import write_dataset  # after the checks above are installed
+
+    root = tmp_path_factory.mktemp("toy") / "scene"
+    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
+    return root
+
+
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A module's feature store, which goes with it: nothing that tests write takes as much room."""

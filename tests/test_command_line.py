@@ -16,7 +16,6 @@ from pipeline.report.run_records import read_run_records
 from pipeline.stages.render.raycast import Raycast
 from pipeline.synthetic import demo, scenes
 from pipeline.synthetic.demo import DemoConfig
-from pipeline.synthetic.scenes import write_dataset
 
 SMALL = (
     "render.count=12",
@@ -28,13 +27,6 @@ SMALL = (
     "runtime.progress=false",
     "runtime.device=cpu",
 )
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("synthetic") / "scene"
-    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
-    return root
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from pipeline.report.run_records import read_run_records
 from pipeline.spec import Runtime
 from pipeline.store import LocalStoreConfig, Store, make_ref
 from pipeline.store.admin import list_entries
-from pipeline.synthetic.scenes import write_dataset
 from tests.command import run_dzop
 from tests.same_bytes import contents, poses
 from tests.test_pins import toy_crops, variant
@@ -37,13 +36,6 @@ SETTINGS = [("runtime.batch=1", "threads=2"), ("runtime.batch=4", "threads=1"), 
 def default_threads():
     yield
     use_threads(0)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("synthetic") / "scene"
-    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
-    return root
 
 
 @pytest.fixture

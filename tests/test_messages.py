@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import CommandResult, restore_ctrl_c, run_dzop
+from command import CommandResult, restore_signals, run_dzop
 from make_vit import write_vit
 from PIL import Image
 
@@ -260,7 +260,7 @@ def test_ctrl_c_prints_one_line():
 def test_ctrl_c_during_imports_prints_no_traceback(tmp_path):
     command = [sys.executable, "-m", "pipeline", "step=detect"]
     process = subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=restore_ctrl_c
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=restore_signals
     )
     maps = Path(f"/proc/{process.pid}/maps")
     until = time.monotonic() + 30

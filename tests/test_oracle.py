@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from array_bank import ArrayBank
+from array_bank import array_bank
 
 from benchmarks.presets import PAPER
 from pipeline.bop.dataset import Dataset, open_dataset
 from pipeline.functional import camera, rigid
 from pipeline.graph import Context, Graph
+from pipeline.graph.bank import StoredBank
 from pipeline.items.errors import PoseErrors
 from pipeline.items.features import CropFeatures
 from pipeline.items.online import Query, TemplateView
@@ -54,9 +55,9 @@ ABLATIONS = {
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> Dataset:
-    """Sixty instances of five objects, half of them occluded."""
+    """Sixty instances of three objects, half of them occluded."""
     root = tmp_path_factory.mktemp("oracle") / "scenes"
-    write_dataset(root, objects=5, images=12, per_image=5, occluded=0.5, seed=11, progress=False)
+    write_dataset(root, objects=3, images=20, per_image=3, occluded=0.5, seed=11, progress=False)
     return open_dataset(root, name="oracle")
 
 
@@ -111,9 +112,9 @@ def magnified_query(factor: int, crop_stage: Square | Virtual = FULL.crop) -> tu
     return Query(*views[1]), template
 
 
-def bank_of_one(view: TemplateView) -> ArrayBank:
+def bank_of_one(view: TemplateView) -> StoredBank:
     """A bank of a single view."""
-    return ArrayBank(view.crop.maps[FULL.match.layer][None], view.crop.mask[None], views=(view,))
+    return array_bank(view.crop.maps[FULL.match.layer][None], view.crop.mask[None], views=(view,))
 
 
 @pytest.mark.parametrize("plane", ["image", "crop"])

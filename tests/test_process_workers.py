@@ -12,24 +12,12 @@ from pipeline.process_workers import LocalRuntime
 from pipeline.spec import build
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.store.admin import list_entries
-from pipeline.synthetic.scenes import write_dataset
-from tests.command import run_dzop
+from tests.command import TOY, run_dzop, toy_arguments
 from tests.same_bytes import contents, poses
-
-SMALL = ("method=dzop", "extract=pixels", "render.count=30", "render.size=96", "overlays=false", "gallery=0",
-         "threads=1", "runtime.progress=false", "evaluate.vsd=false")  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("synthetic") / "scene"
-    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
-    return root
 
 
 def arguments(scene: Path, folder: Path, *overrides: str) -> list[str]:
-    places = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"store.root={folder}/cache")
-    return [*places, f"out={folder}/out", *SMALL, *overrides]
+    return toy_arguments(scene, folder, "render.count=30", *overrides)
 
 
 def test_two_processes_write_the_bytes_of_one_and_end_with_the_run(scene, tmp_path, capsys, monkeypatch):
@@ -38,11 +26,12 @@ def test_two_processes_write_the_bytes_of_one_and_end_with_the_run(scene, tmp_pa
         ran = run_dzop(capsys, monkeypatch, *arguments(scene, tmp_path / workers, f"runtime.workers={workers}"))
         assert ran.status == 0, ran.err
         store = Store(LocalStoreConfig(root=f"{tmp_path}/{workers}/cache"))
-        found[workers] = contents(store) | {"csv": poses(tmp_path / workers / "out")}
+        found[workers] = contents(store) | {"csv": poses(tmp_path / workers / "results")}
         assert ran.counts()[0]["poses"] == (4, 0)
     assert sorted(n for n in found["1"].keys() | found["2"].keys() if found["1"].get(n) != found["2"].get(n)) == []
-    children = [child for child in psutil.Process().children(recursive=True) if child.is_running()]
-    assert not [child for child in children if any("loky.backend.popen" in word for word in child.cmdline())]
+    children = psutil.Process().children(recursive=True)
+    left = [child for child in children if any("loky.backend.popen" in word for word in child.cmdline())]
+    assert not psutil.wait_procs(left, timeout=20)[1]
 
 
 def test_a_lost_process_ends_the_run_in_one_line_and_the_next_run_resumes(scene, tmp_path, capsys, monkeypatch):
@@ -63,8 +52,8 @@ def _end_process(task: str, item: object) -> None:
 
 
 def test_processes_need_a_store_that_they_share(scene, tmp_path, capsys, monkeypatch):
-    places = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"out={tmp_path}/out")
-    ran = run_dzop(capsys, monkeypatch, *places, *SMALL, "store=memory", "runtime.workers=2")
+    places = (f"dataset.root={scene}", f"out={tmp_path}/results")
+    ran = run_dzop(capsys, monkeypatch, *TOY, *places, "store=memory", "runtime.workers=2")
     assert ran.status == 1
     assert "found memory with runtime.workers=2" in ran.err
 

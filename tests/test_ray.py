@@ -13,28 +13,15 @@ import pytest
 
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.store.leases import live_leases
-from pipeline.synthetic.scenes import write_dataset
-from tests.command import run_dzop, run_dzop_for_module
+from tests.command import run_dzop, run_dzop_for_module, toy_arguments
 from tests.same_bytes import contents, poses
 
 ROOT = Path(__file__).parents[1]
-SMALL = ("method=dzop", "extract=pixels", "render.count=60", "render.size=96", "overlays=false", "gallery=0",
-         "threads=1", "runtime.progress=false", "evaluate.vsd=false")  # fmt: skip
-
-
 SMALL_NODE = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80_000_000}
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("synthetic") / "scene"
-    write_dataset(root, objects=2, images=2, seed=3, size_hw=(240, 320), per_image=2, progress=False)
-    return root
-
-
 def arguments(scene: Path, folder: Path, *overrides: str) -> list[str]:
-    places = ("dataset=bop", "dataset.name=toy", f"dataset.root={scene}", f"store.root={folder}/cache")
-    return [*places, f"out={folder}/results", *SMALL, *overrides]
+    return toy_arguments(scene, folder, "render.count=60", *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from command import CommandResult, run_dzop
+from command import CommandResult, restore_signals, run_dzop
 
 from pipeline.report.run_records import read_run_records
 from pipeline.synthetic.scenes import write_dataset
@@ -54,8 +54,8 @@ def start(tmp_path):
 
     def popen(arguments: list[str]) -> subprocess.Popen:
         command, env = [sys.executable, "-m", "pipeline", *arguments], os.environ | {"PYTHONPATH": str(ROOT)}
-        pipe = subprocess.PIPE
-        return subprocess.Popen(command, cwd=tmp_path, env=env, stdout=pipe, stderr=pipe, text=True)
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(command, cwd=tmp_path, env=env, preexec_fn=restore_signals, **streams)
 
     return popen
 

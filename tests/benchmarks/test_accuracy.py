@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import restore_ctrl_c
+from command import restore_signals
 
 from benchmarks import accuracy
 from pipeline.items.scores import Scores
@@ -78,7 +78,7 @@ SMALL = ("dataset.objects=1", "dataset.images=2", "dataset.per_image=1", "render
 def started(folder: Path, *more: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "benchmarks.accuracy", "--folder", str(folder), "--jobs", "2", *more]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, **streams, start_new_session=True, preexec_fn=restore_ctrl_c)
+    return subprocess.Popen(command, **streams, start_new_session=True, preexec_fn=restore_signals)
 
 
 def test_a_run_that_fails_gives_no_table_and_no_traceback(tmp_path):

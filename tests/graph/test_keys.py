@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -479,7 +479,7 @@ EDITS: dict[str, Callable[[Any], Any]] = {  # fields of configs whose change lea
 
 
 def weight_changes(folder: Path) -> Iterator[tuple[str, Callable[[Path], None]]]:
-    """Every file of a folder changed, and files that are not there added."""
+    """Every file of a folder changed."""
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         name = path.relative_to(folder).as_posix()
         if path.suffix == ".safetensors":
@@ -491,10 +491,21 @@ def weight_changes(folder: Path) -> Iterator[tuple[str, Callable[[Path], None]]]
                 yield f"{name} {field}", field_of(name, field, value=EDITS[field])
         else:
             yield name, lambda root, name=name: (root / name).write_text("#version: 0.2\na b</w>\n")
-    for place in {path.parent for path in folder.rglob("*") if path.is_file()}:
-        for added, content in ADDED.items():
-            name = (place / added).relative_to(folder).as_posix()
-            yield f"new {name}", lambda root, name=name, content=content: (root / name).write_text(json.dumps(content))
+
+
+def added_files(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Each folder that has files, with the paths of files that are not there."""
+    for place in sorted({path.parent for path in folder.rglob("*") if path.is_file()}):
+        name = place.relative_to(folder)
+        yield name.as_posix(), [(name / added).as_posix() for added in ADDED]
+
+
+def add_files(names: Sequence[str]) -> Callable[[Path], None]:
+    def edit(root: Path) -> None:
+        for name in names:
+            (root / name).write_text(json.dumps(ADDED[Path(name).name]))
+
+    return edit
 
 
 def change_tensor(path: Path) -> None:
@@ -524,15 +535,25 @@ def test_every_file_of_weights_is_in_a_key(name: str, tiny: Path, weights: Path,
         return bop(tiny, replace(BASE, extract=extract), select=Select(objects=(1,)))
 
     perturbations = Perturbations(run(weights / name))
-    for number, (change, edit) in enumerate(weight_changes(weights / name)):
-        folder = tmp_path / str(number)
-        shutil.copytree(weights / name, folder)
+
+    def check(change: str, edit: Callable[[Path], None]) -> bool:
+        """Whether the change gives another key; the bytes are compared otherwise."""
+        folder = shutil.copytree(weights / name, tmp_path / "changed")
         edit(folder)
+        known = perturbations.by_key
         try:
             perturbations.change(f"{name}: {change}", run(folder))
         except BadInput:  # a broken tokenizer gives no tokens, so there is no key
             assert "tokenizer" in change
         shutil.rmtree(folder)
+        return perturbations.by_key > known
+
+    for change, edit in weight_changes(weights / name):
+        check(change, edit)
+    for place, names in added_files(weights / name):
+        if check(f"all new files in {place}", add_files(names)):  # each alone, so that none hides behind another
+            for added in names:
+                check(f"new {added}", add_files([added]))
     report(perturbations, f"weights of {name}", record_property)
 
 

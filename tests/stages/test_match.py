@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from array_bank import ArrayBank, match_truth
+from array_bank import array_bank, match_truth
 from array_bank import match as match_maps
 from beartype.roar import BeartypeCallHintViolation
 
@@ -150,19 +150,11 @@ def test_words_of_features_that_are_not_finite_or_tell_nothing_apart_say_why():
         match_maps(WORDS[0], bank[0].float(), mask[0], bank[:1], mask[:1])  # every word is in the only template
 
 
-class BankWithToken(ArrayBank):
-    tokens: torch.Tensor
-
-    def maps(self, layer: int) -> torch.Tensor:
-        return self.tokens if layer == CLASS_FACET_LAYER else self.features
-
-
 @pytest.mark.parametrize("scale", [0.0, 1.0, 30.0])
 def test_the_class_token_is_one_more_cell(scale):
     features, mask = _bank()
     tokens = scale * torch.randn(len(mask), 10, 1, 1, generator=torch.Generator().manual_seed(1))
-    bank = BankWithToken(features, mask)
-    bank.tokens = tokens
+    bank = array_bank(features, mask, maps=lambda layer: tokens if layer == CLASS_FACET_LAYER else features)
     maps = {2: features[3].float() + features[7].float(), CLASS_FACET_LAYER: tokens[4]}
     spec = Cosine(top_k=12, class_token=True)
     found = spec(Query(CropFeatures(maps, mask[3]), np.eye(3), np.eye(3)), bank)

@@ -151,14 +151,15 @@ def test_another_scale_of_the_crop_changes_nothing(refine):
 @REFINERS
 def test_a_crop_that_a_homography_cuts_from_a_turned_camera_gives_the_same_pose(refine):
     scene = case(3)
+    refine = replace(refine, max_points=10**6) if isinstance(refine, Featuremetric) else refine
     start = off(scene.T_cam_obj, np.random.default_rng(0), 10, 10)
     T_crop_cam = rigid.rigid(cv2.Rodrigues(np.array([0.2, -0.3, 0.1]))[0], np.zeros(3))
     turned = replace(scene, K_crop=scene.K_crop @ T_crop_cam[:3, :3])
     found = turned(refine, rigid.inverse(T_crop_cam) @ start)
-    # damping is by the axes of the camera that is asked, so steps differ and end some hundredths of a millimetre apart
+    # damping is by the axes of the camera that is asked, so steps differ and stop some hundredths of a millimetre apart
     angle_deg, length_mm = errors(T_crop_cam @ found, scene(refine, start))
-    assert angle_deg < 0.01
-    assert length_mm < 0.05
+    assert angle_deg < 0.005
+    assert length_mm < 0.03
 
 
 @pytest.mark.parametrize("loss", ALPHA)
