@@ -428,10 +428,16 @@ def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
         (("dataset.mesh=nowhere.ply",), "nowhere.ply: found no such file"),
         (("dataset.scale=0.001",), "it looks like metres"),
         (("dataset.mask=both.png",), "dataset: found mask and bbox, needs only one of them"),
+        (("dataset.bbox=[0.25,0.5,0.125,0.25]",), "fractions of the image, needs pixels: [80,120,40,60]"),
+        (("dataset.bbox=null", "dataset.mask=folder.ply"), "folder.ply: found a folder, needs a readable file"),
+        (("dataset.mesh=folder.ply",), "folder.ply: found a folder, needs a mesh file"),
+        (("dataset.image=folder.ply",), "folder.ply: found a folder, needs an image"),
+        (("dataset.distortion={k1:0.1,k2:0}",), "dataset.distortion: found {'k1': 0.1, 'k2': 0}, needs [k1,k2,p1,p2]"),
     ],
 )
 def test_a_mistake_in_ones_own_data_is_reported_in_one_line(tmp_path, scene, capsys, monkeypatch, given, message):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.ply").mkdir()
     frame = scene / "test" / "000001" / "rgb" / "000000.png"
     good = (f"dataset.mesh={scene}/models/obj_000001.ply", f"dataset.image={frame}", "dataset.bbox=[100,80,60,60]")
     camera = () if given[0].startswith("dataset.K") else ("dataset.K=[[300,0,160],[0,300,120],[0,0,1]]",)

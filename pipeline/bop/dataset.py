@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.bop.images import image_digest, image_size, read_depth, read_mask, read_orientation, read_rgb
+from pipeline.bop.images import (
+    count_frames,
+    image_digest,
+    image_size,
+    read_depth,
+    read_mask,
+    read_orientation,
+    read_rgb,
+)
 from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
 from pipeline.bop.layout import check_folders, check_scene_folder, check_sensor_name, find_model
 from pipeline.bop.lens import describe_distortion
@@ -164,6 +172,10 @@ class Dataset:
     def orientation(self, scene_id: int, im_id: int) -> int:
         """EXIF orientation of the image's file, 1 for an upright one."""
         return read_orientation(self.image_path(scene_id, im_id))
+
+    def count_frames(self, scene_id: int, im_id: int) -> int:
+        """Frames of the image's file, of which the first is read."""
+        return count_frames(self.image_path(scene_id, im_id))
 
     def image_width(self, scene_id: int, im_id: int) -> int:
         """Width of the image, px: of its file, its depth image, camera*.json, or BOP's known width, in this order.

@@ -56,6 +56,10 @@ class Frame(GivenObjects):
         """1: an array is as it is."""
         return 1
 
+    def count_frames(self, scene_id: int, im_id: int) -> int:
+        """1: an array is one image."""
+        return 1
+
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
         """The camera matrix, px."""
         return self.camera_matrix
@@ -94,7 +98,7 @@ def _parse_location(given: Any, size_hw: tuple[int, int], instance: str) -> Loca
     values = np.asarray(given)
     if values.ndim == 1:
         numbers, where = [float(value) for value in values], f"bbox{instance}"
-        check_box(numbers, where)
+        check_box(numbers, size_hw, where)
         box = xyxy_from_xywh(numbers)
         check_box_in_image(box, size_hw, where)
         return box

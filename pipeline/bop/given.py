@@ -135,8 +135,8 @@ def check_own_camera(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], wher
         raise BadInput(where, found=found, needed="the K of this image at this size")
 
 
-def check_box(bbox_xywh: Sequence[float], where: str) -> None:
-    """Raise BadInput for a box that is not four finite numbers with an area."""
+def check_box(bbox_xywh: Sequence[float], size_hw: tuple[int, int], where: str) -> None:
+    """Raise BadInput for a box that is not four finite numbers with an area, or in fractions of the image."""
     if len(bbox_xywh) != 4:
         raise BadInput(where, found=f"{len(bbox_xywh)} numbers", needed="4: [x,y,width,height]")
     if not np.isfinite(bbox_xywh).all():
@@ -144,6 +144,10 @@ def check_box(bbox_xywh: Sequence[float], where: str) -> None:
     if min(bbox_xywh[2:]) <= 0:
         found = f"{list(bbox_xywh)}, which has no area"
         raise BadInput(where, found=found, needed="[x,y,width,height] with width and height above 0")
+    if max(bbox_xywh) <= 1:
+        fitting = ",".join(f"{v * size:.6g}" for v, size in zip(bbox_xywh, 2 * size_hw[::-1], strict=True))
+        found = f"{list(bbox_xywh)}, fractions of the image"
+        raise BadInput(where, found=found, needed=f"pixels: [{fitting}]")
 
 
 def check_box_in_image(box: Box, size_hw: tuple[int, int], where: str) -> None:

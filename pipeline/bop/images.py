@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pipeline.bop.pixels import DEEP_GREY_VERSION, MAX_MEGAPIXELS, check_megapixels, scale_to_8_bits, select_object
 from pipeline.errors import BadInput
 from pipeline.io.digests import file_digest, unchanged_files
-from pipeline.io.files import IMAGE_FORMATS, read_file
+from pipeline.io.files import IMAGE_FORMATS, describe_irregular, read_file
 from pipeline.spec import digest
 
 QUARTER_TURNS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
@@ -71,6 +71,7 @@ def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
 
 PIL.Image.MAX_IMAGE_PIXELS = MAX_MEGAPIXELS * 10**6  # PIL's own limit of 179 would call a large photograph an attack
 warnings.filterwarnings("ignore", category=PIL.Image.DecompressionBombWarning)  # check_megapixels reports it
+_ANIMATED = ("GIF", "PNG", "TIFF", "WEBP")
 _ORIENTATION_TAG = 0x0112
 _EXIF_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")  # keywords of PNG's texts that may state an orientation
 _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
@@ -119,9 +120,21 @@ def read_orientation(path: Path) -> int:
         return 1
 
 
+def count_frames(path: Path) -> int:
+    """Frames or pages of an image file, of which the first is read; 1 for a file that cannot be read.
+
+    The second picture of a phone's JPEG is a preview or a depth map and does not count.
+    """
+    try:
+        with _open_header(path) as image:
+            return getattr(image, "n_frames", 1) if image.format in _ANIMATED else 1
+    except _BROKEN:
+        return 1
+
+
 def _open_header(path: Path) -> PIL.Image.Image:
     if path.exists() and not path.is_file():
-        raise OSError("not a regular file")
+        raise OSError(describe_irregular(path))
     return _require_readable_size(PIL.Image.open(path, formats=IMAGE_FORMATS), path)
 
 
@@ -176,5 +189,7 @@ def _has_exif(image: PIL.ImageFile.ImageFile) -> bool:
 def _unreadable_image(path: Path, error: Exception) -> BadInput:
     if isinstance(error, FileNotFoundError):
         return BadInput(path, found="no such file", needed="an image")
+    if path.exists() and not path.is_file():
+        return BadInput(path, found=describe_irregular(path), needed="an image")
     found = "unknown image format" if isinstance(error, PIL.UnidentifiedImageError) else str(error)
     return BadInput(path, found=f"a broken image ({found})", needed="a complete PNG, JPEG, TIFF or WebP")

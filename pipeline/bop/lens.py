@@ -46,9 +46,11 @@ class Lens:
             ) from None
 
 
-def parse_lens(given: Sequence[Any] | str, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> Lens | None:
+def parse_lens(given: Any, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> Lens | None:
     """``dataset.distortion``, checked; None if all coefficients are 0. Raises BadInput, by name for a fisheye lens."""
     where = "dataset.distortion"
+    if not isinstance(given, str | Sequence):
+        raise BadInput(where, found=given, needed=_NEEDED)
     words = [given] if isinstance(given, str) else [value for value in given if isinstance(value, str)]
     if any(_names_fisheye(word) for word in words):
         raise BadInput(

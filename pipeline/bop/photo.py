@@ -65,7 +65,7 @@ class PhotoConfig(Spec):
     mask_label: Positive | tuple[Positive, ...] | None = None
     bbox: Any = None
     scale: PositiveFloat = 1.0
-    distortion: tuple[Any, ...] | str | None = None
+    distortion: Any = None
     simplify: FaceCount | None = None
     depth: str | None = None
     depth_scale: PositiveFloat = 1.0
@@ -136,7 +136,7 @@ class PhotoConfig(Spec):
             numbers = numbers_in(self.bbox) if isinstance(self.bbox, str) else self.bbox
             if not isinstance(numbers, (tuple, list)) or any(isinstance(n, (str, bool)) for n in numbers):
                 raise BadInput("dataset.bbox", found=repr(self.bbox), needed="[x,y,width,height]")
-            check_box(numbers, "dataset.bbox")
+            check_box(numbers, image_size(photos[0]), "dataset.bbox")
             if len(photos) > 1:
                 found = f"one box for {len(photos)} photographs"
                 raise BadInput("dataset.bbox", found=found, needed="dataset.mask, one for each photograph")

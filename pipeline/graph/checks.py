@@ -75,6 +75,9 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
             warnings.append(f"{context.dataset.image_name(scene_id, im_id)}: {problem}")
+        if not annotated and (frames := context.dataset.count_frames(scene_id, im_id)) > 1:
+            name = context.dataset.image_name(scene_id, im_id)
+            warnings.append(f"{name}: its file has {frames} frames: the first is used")
         if reason := context.dataset.distortion(scene_id, im_id):
             warnings.append(f"{context.dataset.image_name(scene_id, im_id)}: {reason}")
     for d in detections:

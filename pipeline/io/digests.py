@@ -217,8 +217,9 @@ def file_digest(path: Path) -> str:
     try:
         return _digest_of(path, FileState.of(str(path)), None) if _tracked is None else _tracked.digest(path)
     except (OSError, ValueError) as error:
-        found = error.strerror if isinstance(error, OSError) else error
-        raise BadInput(path, found=found, needed="a readable file") from None
+        found = getattr(error, "strerror", error)
+        folder = isinstance(error, IsADirectoryError)
+        raise BadInput(path, found="a folder" if folder else found, needed="a readable file") from None
 
 
 def files_digest(paths: Mapping[str, Path]) -> str:

@@ -22,13 +22,18 @@ def read_file(path: Path, needed: str) -> bytes:
     """
     try:
         if file_exists(path) and not path.is_file():
-            raise BadInput(path, found="not a regular file", needed=needed)
+            raise BadInput(path, found=describe_irregular(path), needed=needed)
         content = path.read_bytes()
         record_content(path, content)
         return content
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
         found = "no such file" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", error)
         raise BadInput(path, found=found, needed=needed) from None
+
+
+def describe_irregular(path: Path) -> str:
+    """What an existing path is that is no regular file."""
+    return "a folder" if path.is_dir() else "not a regular file"
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

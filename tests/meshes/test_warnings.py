@@ -46,6 +46,14 @@ def write_gltf_that_glows(folder: Path) -> Path:
     return folder / "glow.glb"
 
 
+def write_ball_with_a_stray_face(folder: Path) -> Path:
+    ball = trimesh.creation.icosphere(3, 30)
+    far = len(ball.vertices) + np.arange(3)
+    vertices = np.concatenate([ball.vertices, [[200, 0, 0], [202, 0, 0], [200, 2, 0]]])
+    trimesh.Trimesh(vertices, np.concatenate([ball.faces, far[None]]), process=False).export(folder / "stray.stl")
+    return folder / "stray.stl"
+
+
 def _box():
     box = trimesh.creation.box((40, 60, 20))
     return box.vertices, box.faces
@@ -55,6 +63,7 @@ CASES = {
     "colours": (write_plain_stl, "it has no colours, so templates are grey"),
     "material": (write_obj_without_its_material, "its material 'paint' is in no material file"),
     "properties": (write_ply_with_grey_levels, "its properties intensity are not read as colours"),
+    "stray": (write_ball_with_a_stray_face, "1 face, 0.00018 of its surface, enlarge it from 104 to 247 mm"),
     "glow": (write_gltf_that_glows, "its material has a texture that glows"),
 }
 

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.io.meshes.diameter import diameter_mm
 from pipeline.io.meshes.reading import identify_mesh, read_mesh
 from pipeline.io.meshes.simplify import SIMPLIFY_VERSION, simplify_mesh
+from pipeline.io.meshes.stray import describe_stray_faces
 from pipeline.items.objects import Mesh, MeshFacts
 from pipeline.spec import digest
 
@@ -29,6 +30,7 @@ def prepare_mesh(path: Path, *, scale: float = 1.0, simplify: int | None = None)
     warnings = mesh.warnings
     if mesh.colours is None and mesh.texture is None:
         warnings += (NO_COLOURS,)
+    warnings += describe_stray_faces(mesh)
     if simplify is not None and len(mesh.faces) > simplify:
         mesh, note = simplify_mesh(mesh, simplify, diameter)
         warnings += (note,)

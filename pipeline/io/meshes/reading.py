@@ -10,6 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from pipeline.errors import BadInput, DzopError
+from pipeline.io.files import describe_irregular
 from pipeline.io.meshes.checks import check_mesh
 from pipeline.io.meshes.companions import Companions
 from pipeline.io.meshes.gltf import parse_gltf
@@ -74,7 +75,8 @@ def _check_path(path: Path) -> Path:
     if path.suffix.lower() not in SUFFIXES:
         raise BadInput(path, found=f"suffix {path.suffix!r}", needed=f"a mesh: {', '.join(SUFFIXES)}")
     if not path.is_file():
-        raise BadInput(path, found="no such file", needed="a mesh file")
+        found = describe_irregular(path) if path.exists() else "no such file"
+        raise BadInput(path, found=found, needed="a mesh file")
     return path
 
 
