@@ -125,6 +125,7 @@ def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[
     (bias_20, *w_20), (bias_10, *w_10) = (fit_signed(x, right(examples, limit), signs) for limit in LIMITS)
     weights = zip(terms, w_20, w_10, strict=True)
     fitted = [replace(term, weight_20=round(float(a), 5), weight_10=round(float(b), 5)) for term, a, b in weights]
+    fitted = [term for term in fitted if term.weight_20 or term.weight_10]
     calibration = Calibration(
         kinds=kinds,
         recipes=recipes,

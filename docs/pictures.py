@@ -25,7 +25,7 @@ MUG = 3  # object with a handle
 MUG_XYXY = (640, 480, 1280, 960)  # the quarter of the overlay that shows it
 VIEWS = 300  # templates of an object of the demo
 MARGIN_PX = 8
-EXCERPT = ("name", "status", "T_cam_obj", "score", "inliers", "correspondences", "reprojection_px")
+EXCERPT = ("name", "status", "T_cam_obj", "confidence", "decision", "inliers", "correspondences")
 
 
 def main() -> None:
