@@ -12,6 +12,7 @@ from pipeline.functional.rigid import rotation_angle_deg, transform
 Pose = Float[np.ndarray, "4 4"]
 Vertices = Float[np.ndarray, "v 3"]
 _BLOCK_FLOATS = 1 << 22  # coordinates computed at a time for all symmetries, 32 MiB
+_MAX_MERGED = 5_000  # vertices above which Qhull joggles instead of merging facets
 
 
 def rotation_error_deg(T_est: Pose, T_gt: Pose) -> float:
@@ -74,9 +75,14 @@ def mspd(
 
 
 def hull_vertices(vertices: Vertices) -> Float[np.ndarray, "h 3"]:
-    """Vertices of the convex hull; all vertices for a flat object."""
+    """Vertices of the convex hull, to rounding; all vertices for a flat object.
+
+    Larger meshes are joggled (Qhull's QJ), which moves vertices by rounding errors: Qhull would otherwise merge facets
+    that lie in one plane, such as the triangles of a cylinder's cap, in quadratic time.
+    """
+    options = "QJ" if len(vertices) > _MAX_MERGED else None
     try:
-        return vertices[ConvexHull(vertices).vertices]
+        return vertices[ConvexHull(vertices, qhull_options=options).vertices]
     except QhullError:
         return vertices
 

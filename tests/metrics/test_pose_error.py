@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from pipeline.functional.rigid import nearest_rotation, rigid
@@ -124,3 +125,13 @@ def test_published_rotations_give_no_spurious_angle():
     published = rigid(R, np.zeros(3))  # LM-O, image 3, object 1: orthonormal to 1e-2 only
     # the nearest rotation differs by the skew part of the published error, far less than its arc cosine
     assert rotation_error_deg(rigid(nearest_rotation(R), np.zeros(3)), published) < 0.01
+
+
+@pytest.mark.timeout(60)
+def test_hull_of_finely_divided_caps_is_found_without_merging_their_facets():
+    """Qhull merges coplanar facets in quadratic time: minutes for this cylinder."""
+    vertices = np.asarray(trimesh.creation.cylinder(radius=30, height=120, sections=20_000).vertices)
+    directions = np.random.default_rng(0).normal(size=(100, 3))
+    hull = hull_vertices(vertices)
+    assert len(hull) <= len(vertices)
+    assert np.allclose((hull @ directions.T).max(axis=0), (vertices @ directions.T).max(axis=0), rtol=0, atol=1e-9)
