@@ -131,6 +131,10 @@ def _format_error(error: BaseException) -> str:
         group, _, variant = name.rpartition("/")
         note = f" (own variants need --config-dir){suggest_variant(group, variant)}"
         text = f"Could not find '{name}'{note} {listed}"
+    if text.startswith("Ambiguous value for argument"):
+        name, _, value = text.split("'")[1].partition("=")
+        needed = f"brackets around a list, and quotes: '{name}=[{value}]'; or -m, which sweeps over the values"
+        return f"error: {name}: found {value}, needs {needed}"
     if "hydra.cc" in text:  # a value that Hydra's grammar cannot parse
         text = text.split("See https")[0].strip()
         if "missing EQUAL" in text:

@@ -151,7 +151,7 @@ def suggest_field(name: str) -> str:
     """Hint for an unknown field: variants that have it, a parent that is a value, or a field with a similar name."""
     known = _list_fields()
     if choices := known.get(name):
-        return f"; {', '.join(choices)} {'has' if len(choices) == 1 else 'have'} it"
+        return f"; {choices[0]} has it: add {choices[0]}" if len(choices) == 1 else f"; {', '.join(choices)} have it"
     group, dot, field = name.rpartition(".")
     if "." in group and group in known:
         return f"; {group} is a value and has no fields"

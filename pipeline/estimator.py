@@ -126,7 +126,7 @@ class PoseEstimator:
         folder = store.backend.folder
         with track_files(None if folder is None else DigestCache(folder / ".digests")):
             stages, photo = build_stages(values), build_variant(values["dataset"], "dataset")
-            meshes = MeshFiles(tuple(paths), photo.scale, photo.simplify, self.names)
+            meshes = MeshFiles(tuple(paths), photo.scale, photo.simplify, self.names, photo.units)
             dataset = _make_frame(meshes, tuple(Target(SCENE_ID, IM_ID, n + 1) for n in range(len(paths))))
             calibration = choose_calibration(stages, options.confidence)
             progress = Progress(runtime.progress)

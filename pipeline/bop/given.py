@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,19 +23,24 @@ from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Detection, Target
 
 MIN_DIAMETER_MM = 2.0
+MAX_METRES = 3.0  # a smaller diameter is taken as metres where the unit is to be guessed
+Unit = Literal["mm", "cm", "m", "inch", "auto"]
+_FACTORS: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 
 
 @dataclass(frozen=True)
 class MeshFiles:
     """Meshes of the objects 1, 2, ...; ``scale`` multiplies their vertices, ``simplify`` is the most faces of each.
 
-    ``names``: of the objects; those of the files without them.
+    ``names``: of the objects; those of the files without them. ``units``: of the files; "auto" takes a mesh as metres
+    if its diameter is below 3, otherwise as millimetres, and says so in its warnings.
     """
 
     paths: tuple[Path, ...] = ()
     scale: float = 1.0
     simplify: int | None = None
     names: tuple[str, ...] = ()
+    units: Unit = "mm"
 
     def name(self, obj_id: int) -> str:
         """What a user calls an object."""
@@ -46,16 +52,34 @@ class MeshFiles:
 
     def digest(self, obj_id: int) -> str:
         """Digest of an object's mesh, scaled and simplified."""
-        return prepared_digest(self.path(obj_id), scale=self.scale, simplify=self.simplify)
+        return prepared_digest(self.path(obj_id), scale=self._factor(obj_id), simplify=self.simplify)
 
     def model(self, obj_id: int) -> ObjectModel:
         """An object with its mesh scaled and simplified. Raises BadInput for a mesh too small to be in millimetres."""
         path = self.path(obj_id)
-        mesh, facts = prepare_mesh(path, scale=self.scale, simplify=self.simplify)
+        factor = self._factor(obj_id)
+        mesh, facts = prepare_mesh(path, scale=factor, simplify=self.simplify)
+        if self.units == "auto" and factor != self.scale:
+            guess = f"taken as metres (units=auto), which makes its diameter {facts.diameter_mm:.4g} mm"
+            facts = replace(facts, warnings=(*facts.warnings, guess))
         if facts.diameter_mm < MIN_DIAMETER_MM:
             found = f"a mesh of diameter {facts.diameter_mm:.3g} (it looks like metres)"
             raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
         return ObjectModel(obj_id, mesh, facts.diameter_mm, facts=facts)
+
+    def _factor(self, obj_id: int) -> float:
+        """Millimetres per unit of the file."""
+        if self.units != "auto":
+            return self.scale * _FACTORS[self.units]
+        path = self.path(obj_id)
+        is_metres = self.scale * _diameter_in_file(path, prepared_digest(path)) < MAX_METRES
+        return self.scale * (_FACTORS["m"] if is_metres else 1.0)
+
+
+@lru_cache(maxsize=64)
+def _diameter_in_file(path: Path, content: str) -> float:
+    """The diameter of a mesh file of this content, in the file's own unit."""
+    return prepare_mesh(path)[1].diameter_mm
 
 
 @dataclass(frozen=True, eq=False)

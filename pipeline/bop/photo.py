@@ -13,6 +13,7 @@ from pipeline.bop.camera_files import NEEDED, CameraFile, estimate_camera, numbe
 from pipeline.bop.given import (
     GivenObjects,
     MeshFiles,
+    Unit,
     check_box,
     check_box_in_image,
     check_own_camera,
@@ -50,7 +51,7 @@ class PhotoConfig(Spec):
     numbers of the matrix row by row, a camera file, or "exif". ``mask``: a file, a pattern or several; with several
     photographs, masks belong to the photograph whose name theirs begins with, several to several instances.
     ``mask_label``: the object's value, or those of its instances, in a mask that labels several. ``bbox``: x, y, width,
-    height in pixels. ``scale`` multiplies the mesh's vertices: 1000 for a mesh in metres. ``distortion``: k1, k2, p1,
+    height in pixels. ``scale`` multiplies the mesh's vertices, whose unit is ``units``. ``distortion``: k1, k2, p1,
     p2[, k3[, k4, k5, k6]] of OpenCV's model; photographs, masks and the box are undistorted before anything else.
     ``simplify``: most faces of a mesh, None for all. ``depth``: depth image of the photograph's size, ``depth_scale``
     mm per unit.
@@ -65,6 +66,7 @@ class PhotoConfig(Spec):
     mask_label: Positive | tuple[Positive, ...] | None = None
     bbox: Any = None
     scale: PositiveFloat = 1.0
+    units: Unit = "mm"
     distortion: Any = None
     simplify: FaceCount | None = None
     depth: str | None = None
@@ -99,7 +101,9 @@ class PhotoConfig(Spec):
             targets=tuple(Target(SCENE_ID, n, obj_id, count) for n, count in enumerate(counts) for obj_id in objects),
             warnings=(EXIF_WARNING,) if self.K == "exif" else (),
             photos=photos,
-            meshes=MeshFiles(tuple(Path(mesh).expanduser() for mesh in meshes), self.scale, self.simplify),
+            meshes=MeshFiles(
+                tuple(Path(mesh).expanduser() for mesh in meshes), self.scale, self.simplify, units=self.units
+            ),
             camera_matrix=camera.K,
             mask_label=self.mask_label,
             masks=masks,

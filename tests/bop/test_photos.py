@@ -1,6 +1,7 @@
 """dataset=photo: several photographs and instances, and the places that K may come from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -144,3 +145,17 @@ def test_the_exif_focal_length_is_a_guess_with_a_warning(folder):
 def test_numbers_in_words():
     assert numbers_in("600 600 320,240") == numbers_in("[600, 600, 320, 240]") == [600, 600, 320, 240]
     assert numbers_in("camera.yaml") is None
+
+
+def test_units_of_a_mesh(folder):
+    diameter = config(folder).open().object_model(1).diameter_mm
+    mesh = make_object(3)
+    write_ply(folder / "metres.ply", replace(mesh, vertices=mesh.vertices / 1000))
+    for units, name, factor in (("cm", "mug", 10), ("inch", "mug", 25.4), ("auto", "mug", 1), ("auto", "metres", 1)):
+        photo = config(folder, mesh=str(folder / f"{name}.ply"), units=units).open()
+        model = photo.object_model(1)
+        assert model.diameter_mm == pytest.approx(factor * diameter, rel=1e-4)
+        assert photo.mesh_digest(1) == model.mesh.digest
+        assert any("taken as metres" in text for text in model.facts.warnings) == (name == "metres")
+    metres = config(folder, mesh=str(folder / "metres.ply"), units="m").open().object_model(1)
+    assert metres.diameter_mm == pytest.approx(diameter, rel=1e-4)

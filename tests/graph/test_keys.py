@@ -373,6 +373,7 @@ def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property
         **{f"K[{i}]": {"K": tuple(v + 0.25 * (i == k) for k, v in enumerate(K))} for i in range(4)},
         "scale": {"scale": 1.01},
         "simplify": {"simplify": 8},
+        "units": {"units": "cm"},
         "box": box,
         "other box": box | {"bbox": (15.0, 17.0, 9.0, 13.0)},
         "distortion": {"distortion": (-0.05, 0.0, 0.0, 0.0)},
