@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bop.frame import Frame, parse_image, parse_locations
+from pipeline.bop.frame import Frame, parse_depth, parse_image, parse_locations
 from pipeline.bop.given import MeshFiles, check_own_camera, parse_K
 from pipeline.confidence.calibration import choose_calibration
 from pipeline.configuration import build_options, build_stages, build_variant, compose_settings
@@ -76,11 +76,13 @@ class PoseEstimator:
         mask: np.ndarray | None = None,
         bbox: Sequence[float] | None = None,
         name: str | None = None,
+        depth_mm: np.ndarray | None = None,
     ) -> PoseResult:
         """The pose of one object in an image.
 
         ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. ``mask``: h x w, not 0 on
         the object; or ``bbox``: x, y, width, height. ``name``: the object's, if the estimator has several.
+        ``depth_mm``: h x w, registered to the image, 0 where unknown; the pose is fitted to it.
         """
         if (mask is None) == (bbox is None):
             found = "neither" if mask is None else "both"
@@ -88,14 +90,18 @@ class PoseEstimator:
         if name is None and len(self.names) > 1:
             raise BadInput("name", found="nothing", needed=f"one of {', '.join(self.names)}")
         given = bbox if mask is None else np.asarray(mask)
-        return self.find(rgb, K, {self.names[0] if name is None else name: given})[0]
+        return self.find(rgb, K, {self.names[0] if name is None else name: given}, depth_mm=depth_mm)[0]
 
-    def find(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> tuple[PoseResult, ...]:
+    def find(
+        self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any], *, depth_mm: np.ndarray | None = None
+    ) -> tuple[PoseResult, ...]:
         """The poses of several objects or instances in one image, in the order given.
 
         ``locations``: by name, a mask, a box [x, y, width, height], or a list of them for several instances.
         """
         frame = self._frame(parse_image(rgb), K, locations)
+        if depth_mm is not None:
+            frame = replace(frame, depth=parse_depth(depth_mm, (frame.rgb.shape[0], frame.rgb.shape[1])))
         with self._lock:
             return self._estimate(frame, list(locations))
 

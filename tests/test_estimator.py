@@ -87,6 +87,18 @@ def test_several_objects_and_instances_come_in_the_order_given(estimator, folder
         np.testing.assert_allclose(R, result.T_cam_obj[:3, :3], atol=1e-9)
 
 
+def test_a_depth_image_gives_the_distance(estimator, folder):
+    rgb, mask = read(folder / "shot.png"), read(folder / "mug_mask.png")
+    mesh, (_, angles, t) = make_object(3), POSES["mug"]
+    T = rigid(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), np.array(t))
+    depth_mm = Raycast().render(mesh, K, T[None], SIZE_HW)[1][0]
+    without = estimator(rgb, K, mask=mask, name="mug")
+    fitted = estimator(rgb, K, mask=mask, name="mug", depth_mm=depth_mm)
+    assert abs(fitted.T_cam_obj[2, 3] - 500) < min(2, abs(without.T_cam_obj[2, 3] - 500))
+    with pytest.raises(BadInput, match=r"depth_mm: found shape \(3, 3\), needs that of the image, 240 x 320"):
+        estimator(rgb, K, mask=mask, name="mug", depth_mm=np.zeros((3, 3)))
+
+
 def test_an_overlay_shows_the_pose_and_its_axes(estimator, folder):
     rgb, mask = read(folder / "shot.png"), read(folder / "mug_mask.png")
     overlay = estimator(rgb, K, mask=mask, name="mug").overlay()

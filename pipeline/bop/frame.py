@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.bop.given import GivenObjects, check_box, check_box_in_image, detect_box, detect_mask
 from pipeline.bop.pixels import select_object
@@ -30,6 +30,22 @@ class Frame(GivenObjects):
     rgb: UInt8[np.ndarray, "H W 3"] = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     locations: Mapping[int, Sequence[Location]] = field(default_factory=dict)
+    depth: Float32[np.ndarray, "H W"] | None = None
+
+    @property
+    def gives_depth(self) -> bool:
+        """Whether there is a depth image."""
+        return self.depth is not None
+
+    def depth_mm(self, scene_id: int, im_id: int) -> Float32[np.ndarray, "H W"]:
+        """Measured depth along the optical axis, mm; 0 where unknown. Raises BadInput without one."""
+        if self.depth is None:
+            raise BadInput("depth_mm", found="nothing", needed="a depth image, or the setting depth=given")
+        return self.depth
+
+    def depth_identity(self, scene_id: int, im_id: int) -> str:
+        """Digest of the measured depth."""
+        return sha256(np.ascontiguousarray(self.depth_mm(scene_id, im_id)).data).hexdigest()
 
     def image(self, scene_id: int, im_id: int) -> Image:
         """The image."""
@@ -82,6 +98,17 @@ def parse_image(rgb: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise BadInput("rgb", found=f"{image.dtype} of shape {image.shape}", needed="uint8 of shape (h, w, 3), in rgb")
     return np.repeat(image[..., None], 3, axis=-1) if image.ndim == 2 else image
+
+
+def parse_depth(depth_mm: np.ndarray, size_hw: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
+    """A depth image in mm, 0 where it is unknown (NaN and infinity as well). Raises BadInput for another shape."""
+    depth = np.nan_to_num(np.asarray(depth_mm, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    if depth.shape != size_hw:
+        needed = f"that of the image, {size_hw[0]} x {size_hw[1]} (rows x columns): register depth to colour first"
+        raise BadInput("depth_mm", found=f"shape {depth.shape}", needed=needed)
+    if depth.min(initial=0) < 0:
+        raise BadInput("depth_mm", found="negative values", needed="millimetres along the optical axis, 0 for unknown")
+    return depth
 
 
 def parse_locations(given: Any, size_hw: tuple[int, int]) -> tuple[Location, ...]:
