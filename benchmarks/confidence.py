@@ -50,7 +50,6 @@ TERMS = (
     ("inlier_ratio", "linear", 1),
     ("reprojection", "log", -1),
     ("similarity", "linear", 1),
-    ("value", "log", 1),
     ("cosine", "linear", 1),
     ("coverage", "linear", 1),
     ("agreeing", "linear", 1),
