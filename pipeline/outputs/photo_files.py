@@ -89,7 +89,10 @@ def _page(results: Sequence[PoseResult], drawn: ndarray, *, title: str, cards: C
         title,
         image.rgb,
         drawn,
-        [ShownPose(r.name, r.summary(), r.T_cam_obj, card) for r, card in zip(results, given, strict=True)],
+        [
+            ShownPose(r.name, r.summary(), r.T_cam_obj, card, r.alternatives)
+            for r, card in zip(results, given, strict=True)
+        ],
         _warnings(results),
         scene_html(placed, image.K, (h, w)) if placed else "",
         note,

@@ -17,7 +17,7 @@ from pipeline.outputs.photo_files import LATEST, Cards, link_latest, save_result
 from pipeline.outputs.pictures import Pictures
 from pipeline.outputs.pose_result import PoseResult, result_of
 
-FILES_VERSION = 1
+FILES_VERSION = 2
 """Raise it when the files of the same results look different."""
 RESERVED = (LATEST, "report", "multirun", "records")  # other things in the folder of results
 

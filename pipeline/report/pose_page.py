@@ -14,9 +14,12 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Float, UInt8
 
+from pipeline.items.poses import Alternative
+
 Picture = UInt8[np.ndarray, "_H _W 3"]
 
 MAX_BYTES = 1_500_000
+MAX_ALTERNATIVES = 3  # of each pose on the page; pose.json has all
 _SIZES = ((1280, 85), (1100, 80), (900, 75), (720, 70), (540, 60))
 """Longer side (px) and quality of the photograph and its overlay: the first with which the page is small enough."""
 _CARD_QUALITY = 75
@@ -24,12 +27,16 @@ _CARD_QUALITY = 75
 
 @dataclass(frozen=True, eq=False)
 class ShownPose:
-    """One result on the page: its line, its matrix if there is a pose, and the card that shows how it was found."""
+    """One result on the page: its line, its matrix if there is a pose, and the card that shows how it was found.
+
+    ``alternatives``: best first.
+    """
 
     name: str
     text: str
     T_cam_obj: Float[np.ndarray, "4 4"] | None
     card: Picture | None = None
+    alternatives: Sequence[Alternative] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +78,23 @@ class PosePage:
             warnings=self.warnings,
             note=self.note,
             poses=[
-                {"name": pose.name, "matrix": _matrix_text(pose.T_cam_obj)}
+                {
+                    "name": pose.name,
+                    "matrix": _matrix_text(pose.T_cam_obj),
+                    "others": [_describe(other) for other in pose.alternatives[:MAX_ALTERNATIVES]],
+                }
                 for pose in self.poses
                 if pose.T_cam_obj is not None
             ],
             scene=self.scene.replace("</script", "<\\/script"),
             **pictures,
         )
+
+
+def _describe(other: Alternative) -> dict[str, str]:
+    weight = "" if other.weight is None else f", probability {other.weight:.2f}"
+    how = f"{other.support:.0%} as well explained{weight}"
+    return {"how": how, "matrix": _matrix_text(other.T_cam_obj)}
 
 
 def _matrix_text(T: Float[np.ndarray, "4 4"]) -> str:

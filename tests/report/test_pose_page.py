@@ -13,6 +13,7 @@ import pytest
 from pipeline.functional.rigid import rigid
 from pipeline.io.meshes.simplify import thin_mesh
 from pipeline.items.objects import Mesh, ObjectModel
+from pipeline.items.poses import Alternative
 from pipeline.items.views import Image
 from pipeline.outputs.photo_files import link_latest, save_results
 from pipeline.outputs.pose_result import PoseResult
@@ -71,6 +72,17 @@ def test_without_a_pose_the_page_says_why_and_has_no_view_in_space(tmp_path):
     assert "<iframe" not in page
     (pose,) = json.loads((tmp_path / "pose.json").read_text())["poses"]
     assert (pose["status"], pose["T_cam_obj"], pose["reason"]) == ("none", None, "3 inliers, needs 6")
+
+
+def test_other_poses_are_in_the_file_and_on_the_page(tmp_path):
+    save_results([result(confidence=0.6, decision="check", alternatives=(Alternative(T, 0.9, 0.3),))], tmp_path)
+    page = (tmp_path / "pose.html").read_text()
+    assert "mug: confidence 0.60 (check), at 600 mm" in page
+    assert "or, 90% as well explained, probability 0.30" in page
+    (pose,) = json.loads((tmp_path / "pose.json").read_text())["poses"]
+    assert (pose["confidence"], pose["decision"]) == (0.6, "check")
+    (other,) = pose["alternatives"]
+    assert (other["T_cam_obj"], other["support"], other["weight"]) == (T.tolist(), 0.9, 0.3)
 
 
 def test_latest_points_to_the_last_folder_and_never_replaces_one_of_the_users(tmp_path):
