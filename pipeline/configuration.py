@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any, cast, get_origin, get_type_hints
 
 from hydra import compose, initialize_config_dir
@@ -52,6 +53,7 @@ def check_fields(values: Mapping[str, Any]) -> None:
 
 def build_stages(values: Mapping[str, Any]) -> Stages:
     """The variant of every stage."""
+    values = drop_replaced_fields(values)
     stages = {name: build_variant(values[name], name) for name in STAGES}
     if hasattr(stages["fuse"], "resolve_for"):
         stages["fuse"] = stages["fuse"].resolve_for(_model_name(stages["extract"]))
@@ -62,6 +64,25 @@ def build_stages(values: Mapping[str, Any]) -> Stages:
     return Stages(**stages, fallback=values["fallback"], second_look=second_look, depth=depth)
 
 
+def drop_replaced_fields(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration without a method's fields for a variant that ``variation=`` replaces by one without them.
+
+    With ``variation=no_clusters``, say, ``method=dzop_paper`` sets ``cluster.planar``, which only k-means has.
+    """
+    kept, path = dict(values), CONF / "method" / f"{values.get('method')}.yaml"
+    if values.get("variation", "none") == "none" or not path.is_file():
+        return kept
+    by_method = OmegaConf.to_container(OmegaConf.load(path))
+    for stage in STAGES:
+        given = by_method.get(stage) if isinstance(by_method, dict) else None
+        variant = values.get(stage)
+        if isinstance(given, dict) and isinstance(variant, Mapping):
+            names = {field.name for field in fields(_find_class(variant.get("_target_"), f"{stage}._target_"))}
+            replaced = {name for name in given if name not in names and variant.get(name) == given[name]}
+            kept[stage] = {name: value for name, value in variant.items() if name not in replaced}
+    return kept
+
+
 def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options:
     """What to run and where to write."""
     given = {name: values[name] for name in OPTIONS}
@@ -70,7 +91,7 @@ def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options
         "select": build(Select, values["select"], where="select"),
         "evaluate": build(Evaluate, values["evaluate"], where="evaluate"),
         "label": {stage: values[stage]["_target_"].rsplit(".", 2)[-2] for stage in STAGES},
-        "config": values,
+        "config": drop_replaced_fields(values),
         "resume": resume,
     }
     return build(Options, given | built, where="")

@@ -6,7 +6,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from pipeline.configuration import build_stages
+from pipeline.configuration import STAGES, build_options, build_stages, drop_replaced_fields
+from pipeline.errors import BadInput
 from pipeline.report.names import AXIS_TITLES
 from pipeline.report.published import ABLATIONS
 
@@ -45,6 +46,24 @@ def test_the_papers_sweeps_run_its_method_on_ground_truth_boxes(name):
 @pytest.mark.parametrize("name", ["hook", "input_size", "layers", "noise", "template_layer", "timesteps"])
 def test_sweeps_over_features_do_not_use_a_head_trained_on_others(name):
     assert composed(f"sweep={name}")["fuse"]["_target_"].endswith("Pca")
+
+
+@pytest.mark.parametrize(("method", "name"), [
+    ("dzop_paper", "no_coprojection"), ("dzop_paper", "no_clusters"), ("dzop_paper", "oracle_correspondences"),
+    ("zs6d", "oracle_template"), ("foundpose", "oracle_template"),
+])  # fmt: skip
+def test_a_variation_takes_the_fields_of_what_it_replaces_with_it(method, name):
+    config = composed(f"method={method}", f"variation={name}")
+    build_stages(config)
+    kept, recorded = drop_replaced_fields(config), build_options(config).config
+    assert kept != config
+    assert {stage: set(kept[stage]) for stage in STAGES} == {stage: set(recorded[stage]) for stage in STAGES}
+
+
+def test_other_fields_that_a_variant_lacks_stay_an_error():
+    config = composed("method=dzop_paper", "variation=no_clusters", "+cluster.seeds=3")
+    with pytest.raises(BadInput, match=r"cluster.seeds: found an unknown field"):
+        build_stages(config)
 
 
 @pytest.mark.parametrize("axis", ABLATIONS)
