@@ -31,7 +31,7 @@ def plan_costs(nodes: Sequence[Node]) -> str:
 def _disk_text(missing: Sequence[Node]) -> str:
     exact_bytes = sum(node.nbytes for node in missing if not _is_compressed(node))
     at_most_bytes = sum(node.nbytes for node in missing if node.sized and _is_compressed(node))
-    text = f"{format_bytes(exact_bytes)} of features and fits"
+    text = f"{format_bytes(exact_bytes)} of features, fits and encodings"
     text += f", at most {format_bytes(at_most_bytes)} of templates and crops (compressed)"
     unsized = dict.fromkeys(node.step for node in missing if not node.sized)
     return f"{text}, and the records of {', '.join(unsized)}" if unsized else text

@@ -21,7 +21,7 @@ def test_the_table_has_a_line_per_node_and_a_total_per_state():
 
 def test_costs_count_only_missing_nodes():
     disk, passes, time = plan_costs([CACHED, MISSING]).splitlines()
-    assert disk.startswith("disk    3.0 kB of features and fits, at most 0 B of templates and crops")
+    assert disk.startswith("disk    3.0 kB of features, fits and encodings, at most 0 B of templates and crops")
     assert passes == "passes  12 images through the backbone"
     assert time == "time    1.5 s (template features 1.5 s)"
 
