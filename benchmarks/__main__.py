@@ -60,12 +60,13 @@ def main() -> None:
     add("--device", default="cpu", help=f"cpu, cuda or cuda:N {default}")
     add("--repeats", type=int, default=7, help=f"repetitions; medians are reported {default}")
     add("--before", default="HEAD~1", help=f"commit that the part before compares this checkout with {default}")
-    add("--lmo", type=Path, help="folder of LM-O, whose poses the part before measures (default: the demo's)")
+    add("--lmo", type=Path, help="folder of LM-O, whose poses before and pose measure (default: the demo's)")
     add("--threads", type=int, default=1, help=f"CPU threads; use 1 on a shared machine {default}")
     args = parser.parse_args()
     if unknown := sorted(set(args.parts) - set(PARTS)):
         parser.error(f"parts: found {', '.join(unknown)}, needs some of {', '.join(PARTS)}")
-    options = {"before": {"revision": args.before, "lmo": args.lmo and args.lmo.resolve()}}
+    lmo = args.lmo and args.lmo.resolve()
+    options = {"before": {"revision": args.before, "lmo": lmo}, "pose": {"lmo": lmo}}
     use_threads(args.threads)
     threadpool_limits(args.threads)  # of BLAS in what is measured besides: numpy, SciPy and scikit-learn
     torch.set_num_threads(args.threads)

@@ -38,14 +38,14 @@ class Usage:
     peak_mb: float
 
 
-def run_dzop(folder: Path, *overrides: str, checkout: Path = ROOT, threads: int = 1) -> Usage:
+def run_dzop(folder: Path, *overrides: str, checkout: Path = ROOT, threads: int = 1, **environment: str) -> Usage:
     """Run ``dzop`` with data, cache and results below ``folder``. Raises CalledProcessError with its output."""
     places = [f"{name}={folder / place}" for name, place in _PLACES.items() if not _is_set(name, overrides)]
     with tempfile.TemporaryDirectory() as name:
         usage = Path(name) / "usage.json"
         command = [sys.executable, "-c", _MEASURE, str(usage), *places, *QUIET, f"threads={threads}", *overrides]
-        environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(checkout)}
-        done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
+        variables = os.environ | ONE_THREAD | {"PYTHONPATH": str(checkout)} | environment
+        done = subprocess.run(command, cwd=checkout, env=variables, capture_output=True, text=True)
         if done.returncode:
             print(done.stderr[-2000:], file=sys.stderr)
             raise subprocess.CalledProcessError(done.returncode, ["dzop", *overrides], done.stdout, done.stderr)

@@ -135,7 +135,9 @@ def _degrade(rgb: UInt8[np.ndarray, "H W 3"], rng: Rng) -> UInt8[np.ndarray, "H 
     image = image + rng.normal(0, rng.uniform(0.004, 0.03), image.shape)
     pixels = (255 * image.clip(0, 1)).astype(np.uint8)
     _, packed = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(45, 95))])
-    return np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
+    decoded = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.ascontiguousarray(decoded[..., ::-1])
 
 
 def _pose_record(placed: PlacedObject) -> dict[str, Any]:
@@ -155,7 +157,8 @@ def _detect(
         box = mask_bbox(mask)
         assert box is not None
         x0, y0, x1, y1 = box
-        record = {"scene_id": 1, "image_id": im_id, "category_id": obj_id, "score": round(0.99 - 0.01 * nth, 6)}
+        score = round(0.99 - 0.01 * nth, 6)
+        record: dict[str, Any] = {"scene_id": 1, "image_id": im_id, "category_id": obj_id, "score": score}
         record |= {"bbox": [x0 + 0.5, y0 + 0.5, x1 - x0, y1 - y0], "time": 0.0}
         if kind != "box":
             record["segmentation"] = encode_rle(mask)
