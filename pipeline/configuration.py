@@ -22,7 +22,9 @@ from pipeline.options import Evaluate, Options, Select
 from pipeline.places import CONF
 from pipeline.spec import build, did_you_mean
 
-STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
+STAGES = (
+    "render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect", "segment",
+)  # fmt: skip
 OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method", "confidence")
 REQUIRED = (*STAGES, *OPTIONS, "second_look", "depth", "fallback", "dataset", "store", "runtime", "select", "evaluate")
 """Fields of config.yaml that a run needs and that ``~field`` on the command line can remove."""

@@ -19,6 +19,8 @@ from pipeline.stages.fuse import Fuser, coarse_shape
 from pipeline.stages.match import Matcher
 from pipeline.stages.refine import Refiner
 from pipeline.stages.render import Renderer
+from pipeline.stages.segment import Segmenter
+from pipeline.stages.segment.none import NoSegmentation
 from pipeline.stages.solve import Solver
 
 ONLINE_STAGES = ("match", "fuse", "cluster", "correspond", "solve", "choose", "refine")
@@ -82,6 +84,12 @@ class Stages:
     fallback: bool = False
     second_look: SecondLook = field(default_factory=SecondLook)
     depth: DepthFit = field(default_factory=DepthFit)
+    segment: Segmenter = field(default_factory=NoSegmentation)
+
+    @property
+    def segments(self) -> bool:
+        """Whether detections without a mask get one."""
+        return self.detect.gives_boxes and self.segment.makes_masks
 
     @property
     def oracle(self) -> str:

@@ -11,7 +11,20 @@ from omegaconf import OmegaConf
 from pipeline.spec import build, lists_to_tuples
 
 CONF = Path(__file__).parents[1] / "conf"
-STAGES = ("render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect")
+STAGES = (
+    "render",
+    "extract",
+    "crop",
+    "match",
+    "fuse",
+    "cluster",
+    "correspond",
+    "solve",
+    "choose",
+    "refine",
+    "detect",
+    "segment",
+)
 VARIANTS = sorted(path for stage in STAGES for path in (CONF / stage).glob("*.yaml"))
 
 

@@ -1,9 +1,18 @@
-"""Boxes (x0, y0, x1, y1), edges in pixels: area, overlap and non-maximum suppression."""
+"""Boxes (x0, y0, x1, y1), edges in pixels: pixels inside, area, overlap and non-maximum suppression."""
 
 from __future__ import annotations
 
+from math import ceil, floor
+
 import numpy as np
 from jaxtyping import Bool, Float
+
+
+def pixels_inside(box: tuple[float, float, float, float], size_hw: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the image's pixels whose centre is in the box; empty slices where there are none."""
+    (x0, y0, x1, y1), (h, w) = box, size_hw
+    rows = slice(max(0, ceil(y0)), max(0, min(h, floor(y1) + 1)))
+    return rows, slice(max(0, ceil(x0)), max(0, min(w, floor(x1) + 1)))
 
 
 def area(boxes: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:

@@ -18,6 +18,7 @@ from pipeline.items.features import CLASS_FACET_LAYER, PSEUDO_LAYERS, SALIENCY_L
 from pipeline.items.objects import MeshFacts
 from pipeline.items.views import Detection
 from pipeline.method import Stages
+from pipeline.stages.segment import Segmenter
 
 MIN_PIXELS = 16  # smaller masks show no shape
 FULL_SHARE = 0.98  # of the image: such a mask is often inverted, or its colours are
@@ -71,6 +72,7 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
     """
     warnings = [*settings_warnings(context.stages), *context.dataset.warnings]
     warnings += context.stages.detect.warnings(context.dataset, context.targets)
+    warnings += box_warnings(detections, context.stages.segment)
     for scene_id, im_id in dict.fromkeys((d.scene_id, d.im_id) for d in detections):
         annotated = context.dataset.has_ground_truth(scene_id)
         if not annotated and (problem := _check_camera(context, (scene_id, im_id))):
@@ -85,6 +87,18 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
             image, name = context.dataset.image_name(d.scene_id, d.im_id), context.dataset.object_name(d.obj_id)
             warnings.append(f"{image}, {name}: {problem}")
     return warnings
+
+
+def box_warnings(detections: Sequence[Detection], segment: Segmenter) -> list[str]:
+    """One line for the detections of which only a box is known, with what that costs."""
+    usable = [d for d in detections if d.defect is None]
+    boxes = [d for d in usable if d.rle is None]
+    if not boxes:
+        return []
+    d, needed = boxes[0], "masks would help" if segment.makes_masks else "segment=grabcut makes masks of boxes"
+    first = f"the first is scene {d.scene_id}, image {d.im_id}, object {d.obj_id}"
+    cost = "what else is in the box counts as object, and most such poses are wrong"
+    return [f"{len(boxes)} of {len(usable)} detections are boxes without a mask ({first}): {cost}; {needed}"]
 
 
 def mesh_warnings(context: Context, facts_of: Callable[[int], MeshFacts]) -> list[str]:
@@ -132,7 +146,9 @@ def _check_camera(context: Context, image: ImageId) -> str:
 
 
 def _check_detection(context: Context, d: Detection) -> str:
-    return _check_box(context, d) if d.rle is None else _check_mask(context, d, d.rle)
+    given_as_box = d.rle is None or context.dataset.given_bbox_xyxy is not None
+    problem = _check_box(context, d) if given_as_box else ""
+    return problem if d.rle is None else problem or _check_mask(context, d, d.rle)
 
 
 def _check_box(context: Context, d: Detection) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from pipeline.bop.images import image_digest
+from pipeline.bop.masks import encode_rle
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
@@ -35,7 +36,10 @@ class DetectionNodes:
     @cached_property
     def ref(self) -> Ref:
         """All detections of the targets."""
-        recipe = {"kind": "detections", "detect": self.context.stages.detect.recipe()}
+        stages = self.context.stages
+        recipe = {"kind": "detections", "detect": stages.detect.recipe()}
+        if stages.segments:
+            recipe["segment"] = stages.segment.recipe()
         targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.context.targets]
         asked: list[Any] = [targets, None]
         if not self.proposals:
@@ -47,7 +51,10 @@ class DetectionNodes:
         proposals, context = self.proposals, self.context
         if proposals is None:
             files = context.stages.detect.sources(context.dataset, context.targets)
-            return {"sources": _digest_sources(files, context.dataset.root)}
+            digests = {"sources": _digest_sources(files, context.dataset.root)}
+            if not context.stages.segments:
+                return digests
+            return digests | {f"image {s}/{i}": context.dataset.image_digest(s, i) for s, i in context.image_ids}
         objects = {f"object {obj_id}": proposals.template_features(obj_id).key for obj_id in context.object_ids}
         images = {f"image {s}/{i}": proposals.features((s, i)).key for s, i in context.image_ids}
         return objects | images
@@ -91,7 +98,16 @@ class DetectionNodes:
     @one_thread_per_kernel()
     def _detect(self) -> list[Detection]:
         descriptors = None if self.proposals is None else self._describe(self.proposals)
-        return self.context.stages.detect(self.context.dataset, self.context.targets, descriptors)
+        detections = self.context.stages.detect(self.context.dataset, self.context.targets, descriptors)
+        return [self._segment(d) for d in detections] if self.context.stages.segments else detections
+
+    def _segment(self, detection: Detection) -> Detection:
+        """The detection with a mask made from its box, if it has none and one is found; the box stays as given."""
+        if detection.rle is not None or detection.defect is not None:
+            return detection
+        photo = self.context.dataset.image(detection.scene_id, detection.im_id)
+        mask = self.context.stages.segment(photo.rgb, detection.bbox_xyxy)
+        return detection if mask is None else replace(detection, rle=encode_rle(mask))
 
     def _describe(self, proposals: ProposalNodes) -> Descriptors:
         """Descriptors of all objects and images, computed where they are missing."""

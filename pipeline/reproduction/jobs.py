@@ -11,7 +11,8 @@ METHOD = "dzop_paper"
 EXTRACT = "stable_diffusion"
 VARIED, VARIED_METHOD = "correspondence", "dzop"
 """The sweep that replaces stages whose fields dzop_paper sets, and the method with the same stages that it takes."""
-ABLATED = "lmo"  # the dataset of the paper's ablations, which use its ground-truth boxes
+ABLATED = "lmo"  # the dataset of the paper's ablations
+BOXES = ("detect=gt_bbox", "segment=none")  # what they are made on
 TIMESTEPS = 10  # of the sweep of that name; 50, one of them, is the default
 # sweep -> (jobs, of which extract features of their own)
 SWEEPS = {
@@ -82,13 +83,13 @@ def _comparison(request: Request, dataset: str, method: str) -> Job:
 
 def _ablations(request: Request) -> list[Job]:
     """The table of correspondence estimation and the curves, on ground-truth boxes as in the paper."""
-    arguments = (*_common(request, ABLATED, request.method), "detect=gt_bbox")
+    arguments = (*_common(request, ABLATED, request.method), *BOXES)
     jobs = [Job(f"{ABLATED}: {request.method} on ground-truth boxes", ABLATED, request.method, arguments, 1, 0, 1)]
     for name, (count, extractions) in SWEEPS.items():
         title, costs = f"{ABLATED}: ablation {name}", (count - 1, extractions, extractions)  # one is the base run
         words = arguments
         if name == VARIED and request.method == METHOD:
-            words = (*_common(request, ABLATED, VARIED_METHOD, extract=EXTRACT), "detect=gt_bbox")
+            words = (*_common(request, ABLATED, VARIED_METHOD, extract=EXTRACT), *BOXES)
             title, costs = f"{title}, of {VARIED_METHOD}", (count, 1, 1)  # its crops are others
         jobs.append(Job(title, ABLATED, request.method, (f"sweep={name}", *words), *costs))
     return jobs

@@ -202,6 +202,7 @@ def changed_stages(way: str, stages: Stages) -> Iterator[dict[str, Any]]:
         yield {"match": replace(stages.match, dim=5)}
     elif way == "boxes":
         yield {"detect": variant("detect/gt_bbox", bbox="visib")}
+        yield {"segment": variant("segment/grabcut")}
     elif way == "cnos":
         yield {"crop": replace(stages.crop, size=72)}
         yield {"detect": replace(stages.detect, describe_layer=2)}

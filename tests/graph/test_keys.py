@@ -98,6 +98,8 @@ def stages_with(name: str, tiny: Path, weights: Path) -> Stages:
         "fuse/learned": {"extract": variant("extract/embedded", input_size=128)},
         "correspond/salient": {"extract": dino},
         "match/cosine": {"extract": dino},  # it has a class token
+        "segment/grabcut": {"detect": variant("detect/gt_bbox")},
+        "segment/none": {"detect": variant("detect/gt_bbox")},
     }
     stage = name.partition("/")[0]
     return replace(BASE, **{stage: variant(name, **given.get(name, {}))}, **others.get(name, {}))
@@ -325,7 +327,7 @@ def stages_of(reader: str, root: Path) -> Stages:
             BASE, **oracle, correspond=variant("correspond/oracle"), second_look=SecondLook(hypotheses=1)
         ),
         "boxes": replace(BASE, detect=variant("detect/gt_bbox", bbox="obj"), crop=variant("crop/square", size=64)),
-        "visible boxes": replace(BASE, detect=variant("detect/gt_bbox")),
+        "visible boxes": replace(BASE, detect=variant("detect/gt_bbox"), segment=variant("segment/grabcut")),
         "detections": replace(BASE, detect=variant("detect/json", path=str(root / "detections.json"))),
     }[reader]
 

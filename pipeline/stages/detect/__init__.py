@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -44,7 +45,12 @@ class Descriptors:
 
 
 class Detector(Spec, ABC):
-    """Contract of a detect variant, which reads its detections from files or compares descriptors."""
+    """Contract of a detect variant, which reads its detections from files or compares descriptors.
+
+    ``gives_boxes``: whether detections may come without a mask; the segment stage then makes one.
+    """
+
+    gives_boxes: ClassVar[bool] = False
 
     @property
     def summary(self) -> str:

@@ -26,6 +26,7 @@ class GtBbox(Detector):
 
     kind: ClassVar[str] = "detect.gt_bbox"
     version: ClassVar[int] = 1
+    gives_boxes: ClassVar[bool] = True
 
     bbox: Literal["visib", "obj"] = "visib"
 

@@ -38,6 +38,7 @@ class Json(Detector):
 
     kind: ClassVar[str] = "detect.json"
     version: ClassVar[int] = 2
+    gives_boxes: ClassVar[bool] = True
 
     path: str = ""
     keep: Literal["inst_count", "all"] | Positive = "inst_count"

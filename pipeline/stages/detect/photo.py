@@ -20,6 +20,7 @@ class PhotoMask(Detector):
 
     kind: ClassVar[str] = "detect.photo"
     version: ClassVar[int] = 2
+    gives_boxes: ClassVar[bool] = True
 
     @property
     def summary(self) -> str:
