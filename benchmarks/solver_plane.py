@@ -1,4 +1,4 @@
-"""Accuracy on large photographs with other values of route.LARGEST_CROP_PX, as a table in Markdown.
+"""Accuracy on large photographs with other values of solve.plane.LARGEST_CROP_PX, as a table in Markdown.
 
 The constant is the size of the largest crop whose solver threshold counts pixels of the photograph. Procedural scenes
 of a seed that no test uses are rendered with multiples of 640 x 480 pixels. Every value solves the same
@@ -18,7 +18,7 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-import pipeline.route
+import pipeline.stages.solve.plane
 from pipeline.bop.results import ResultRow
 from pipeline.configuration import CONF, build_options, build_stages, build_variant
 from pipeline.errors import NoPose
@@ -36,7 +36,7 @@ from pipeline.synthetic.scenes import write_dataset
 
 SEED, OBJECTS, IMAGES, PER_IMAGE = 4711, 6, 12, 5
 VALUES = (96.0, 160.0, 240.0, 320.0, math.inf)
-USUAL = pipeline.route.LARGEST_CROP_PX
+USUAL = pipeline.stages.solve.plane.LARGEST_CROP_PX
 
 
 def benchmark(folder: Path, factors: Sequence[int], extractors: Sequence[str], values: Sequence[float]) -> str:
@@ -81,12 +81,12 @@ def _measure(graph: Graph, values: Sequence[float]) -> tuple[list[float], dict[f
     for detection, query, hypotheses, route in _traces(graph):
         sides.append(graph.context.stages.crop.size / float(query.A_crop_img[0, 0]))
         for value in values:
-            pipeline.route.LARGEST_CROP_PX = value  # type: ignore[assignment]
+            pipeline.stages.solve.plane.LARGEST_CROP_PX = value  # type: ignore[assignment]
             best = route.refine(route.sort([_solve_again(route, h) for h in hypotheses])[0])
             if best.solution is not None:
                 ids = detection.scene_id, detection.im_id, detection.obj_id
                 rows[value].append(ResultRow(*ids, 1.0, best.solution.T_cam_obj, -1.0))
-    pipeline.route.LARGEST_CROP_PX = USUAL
+    pipeline.stages.solve.plane.LARGEST_CROP_PX = USUAL
     scorer = Scorer(graph.context.dataset, graph.context.targets, "models_eval", with_vsd=False)
     return sides, {value: scorer.score(rows[value]).scores for value in values}
 

@@ -23,7 +23,8 @@ from pipeline.places import CONF
 from pipeline.spec import build, did_you_mean
 
 STAGES = (
-    "render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect", "segment",
+    "render", "extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine", "detect",
+    "segment",
 )  # fmt: skip
 OPTIONS = ("step", "plan", "out", "overlays", "gallery", "threads", "method", "confidence")
 REQUIRED = (*STAGES, *OPTIONS, "second_look", "depth", "fallback", "dataset", "store", "runtime", "select", "evaluate")

@@ -34,12 +34,12 @@ class SecondLook(Spec):
     ``block``: side, in cells, of the blocks whose mean feature the first look compares; 1 for every cell. ``solved``:
     hypotheses with most correspondences that the first look solves; 0 for all. ``hypotheses``: how many are rendered,
     best first, and compared cell by cell; 0 for none. No hypothesis is rendered whose points lie, on average, within
-    ``apart`` times the crop's side of where a better one has them, and none after one with ``enough`` of its matches as
-    inliers.
+    ``apart`` times the crop's side of where a better one has them, and none after one whose cells have a mean cosine of
+    ``enough`` with the query's.
     """
 
     kind: ClassVar[str] = "second look"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     hypotheses: NonNegative = 0
     block: Positive = 1

@@ -23,7 +23,7 @@ from pipeline.functional.crop_pose import pose_in_image
 from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
 from pipeline.functional.pnp import reprojection_error_px
-from pipeline.hypotheses import is_convincing, select_distinct, select_matched
+from pipeline.hypotheses import mean_cosine, select_distinct, select_matched
 from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair, PairGeometry
 from pipeline.items.matches import Correspondences, TrueMatches
 from pipeline.items.online import Clock, Hypothesis, Query, TemplateBank, TemplateView, Trace
@@ -32,10 +32,9 @@ from pipeline.method import Stages
 from pipeline.stages.cluster import require_cells
 from pipeline.stages.fuse import coarsen_pair, encode_view
 from pipeline.stages.lift import lift
-from pipeline.stages.solve import Plane
+from pipeline.stages.solve.plane import solver_plane
 
 MIN_POINTS = 4
-LARGEST_CROP_PX = 160  # side, in image pixels, of the largest crop whose solver threshold is in image pixels
 
 
 def trace_pose(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
@@ -101,9 +100,17 @@ class Route:
         apart_px = look.apart * self.stages.crop.size
         for h in select_distinct(hypotheses, K_crop, count=look.hypotheses, apart_px=apart_px):
             seen[h] = self.rerender(h)
-            if is_convincing(seen[h], share=look.enough):
+            if self.is_convincing(seen[h]):
                 break
         return [*self.sort(list(seen.values())), *(h for h in hypotheses if h not in seen)]
+
+    def is_convincing(self, hypothesis: Hypothesis) -> bool:
+        """Whether a rerendered hypothesis looks so similar to the query that no other one is rendered."""
+        view, pair = hypothesis.rerendered, hypothesis.pair
+        if view is None or pair is None:
+            return False
+        with self.clock("choose"):
+            return mean_cosine(hypothesis, self.geometry(view, pair)) >= self.stages.second_look.enough
 
     def rerender(self, first: Hypothesis) -> Hypothesis:
         """Match again with a view rendered in the hypothesis's pose; the first hypothesis where that fails.
@@ -230,19 +237,3 @@ class Route:
         true_px_img = camera.project(query.K, rigid.transform(query.truth.T_cam_obj, points_obj))
         true_px = torch.from_numpy(camera.apply_homography(query.A_crop_img, true_px_img)).to(template_px.device)
         return TrueMatches(template_px, true_px, query.crop.mask)
-
-
-def solver_plane(
-    plane: Plane, query: Query, crop_size: int
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """A_plane_img, K_plane and R_plane_cam of a solver's plane, the pixel frame that its threshold is measured in.
-
-    ``image``: pixels of the photograph; ``crop``: pixels of the query's crop. Large crops are scaled to at most 160 px
-    a side, so that the pixel threshold is not finer than the features.
-    """
-    if plane == "crop":
-        return query.A_crop_img, *camera.crop_camera(query.A_crop_img, query.K)
-    centre = camera.apply_homography(np.linalg.inv(query.A_crop_img), np.full((1, 2), (crop_size - 1) / 2))
-    side_px = crop_size / float(camera.local_zoom(query.A_crop_img, centre)[0])
-    A_plane_img = camera.resize_affine(min(1.0, LARGEST_CROP_PX / side_px))
-    return A_plane_img, A_plane_img @ query.K, np.eye(3)

@@ -107,7 +107,7 @@ class DetectionNodes:
             return detection
         photo = self.context.dataset.image(detection.scene_id, detection.im_id)
         mask = self.context.stages.segment(photo.rgb, detection.bbox_xyxy)
-        return detection if mask is None else replace(detection, rle=encode_rle(mask))
+        return detection if mask is None else replace(detection, rle=encode_rle(mask), guessed=True)
 
     def _describe(self, proposals: ProposalNodes) -> Descriptors:
         """Descriptors of all objects and images, computed where they are missing."""

@@ -23,13 +23,14 @@ from pipeline.graph.queries import CroppedDetection, QueryNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import TemplateNodes
 from pipeline.graph.timings import timing_key
+from pipeline.guesses import trace_guesses
 from pipeline.hypotheses import template_pose
 from pipeline.items.online import Query, Trace, Truth
 from pipeline.items.poses import Alternative, NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
 from pipeline.method import ONLINE_STAGES
-from pipeline.route import Route, trace_pose
+from pipeline.route import Route
 from pipeline.spec import digest
 from pipeline.stages.render.raycast import render_depth
 from pipeline.store import Ref, make_ref
@@ -66,6 +67,8 @@ class PoseNodes:
             recipe["second look"] = stages.second_look.recipe()
         if self._uses_depth:
             recipe["depth"] = stages.depth.recipe()
+        if stages.segments:
+            recipe["segment"] = stages.segment.recipe()
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
             inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key
@@ -174,7 +177,8 @@ class PoseNodes:
             if found is None:
                 raise NoPose("crop", self.queries.crop_failure(index, d))
             query, shared_s = self.query(found)
-            trace = trace_pose(self.context.stages, query, bank)
+            trace = trace_guesses(self.context.stages, query, bank)
+            query = trace.query or query
             template_id = trace.best.template_id
             return self._estimate(nth, d, query, trace, bank, shared_s)
         except NoPose as failure:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -193,7 +193,28 @@ class QueryNodes:
             "extract": max(entry.time_s for entry in entries.values()) / crops.rows,
         }
         crop = CropFeatures(maps, self.context.tensor(mask))
-        return Query(crop, A_crop_img, self.context.K(image)), share
+        others = partial(self._guess_again, found.detection) if self._can_guess(found.detection) else None
+        return Query(crop, A_crop_img, self.context.K(image), others=others), share
+
+    def _can_guess(self, detection: Detection) -> bool:
+        """Whether there are further guesses at a detection's mask: it had a box alone, and features need no truth."""
+        stages = self.context.stages
+        boxed = detection.guessed or detection.rle is None
+        return boxed and stages.segments and not stages.extract.needs_geometry and not stages.oracle
+
+    def _guess_again(self, detection: Detection) -> Iterator[Query]:
+        """The detection with further guesses at its mask, cropped and described anew."""
+        stages = self.context.stages
+        photo = self.context.dataset.image(detection.scene_id, detection.im_id)
+        for mask in stages.segment.others(photo.rgb, detection.bbox_xyxy):
+            try:
+                crop = stages.crop(photo.rgb, stages.crop.clean_query(mask), detection.bbox_xyxy, photo.K)
+            except NoPose:
+                continue
+            maps = self.context.maps(Crops(crop.rgb[None], crop.mask[None], crop.A_crop_img[None]), stages.layers)
+            features = {layer: self.context.tensor(values[0]) for layer, values in maps.items()}
+            described = CropFeatures(features, self.context.tensor(crop.mask))
+            yield Query(described, crop.A_crop_img, photo.K, rgb=crop.rgb)
 
     def crop_failure(self, index: int, d: Detection) -> str:
         """Why a detection has no crop."""

@@ -10,11 +10,11 @@ from jaxtyping import UInt8
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
+from pipeline.guesses import trace_guesses
 from pipeline.items.online import Hypothesis
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
 from pipeline.parallel import one_thread_per_kernel
-from pipeline.route import trace_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,10 @@ class Replayer:
         if answer.template_id is None:
             return Replay(detection, query_rgb)
         bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
-        hypothesis = trace_pose(context.stages, query, bank).best
+        trace = trace_guesses(context.stages, query, bank)
+        hypothesis = trace.best
+        if trace.query is not None and trace.query.rgb is not None:
+            query_rgb = trace.query.rgb
         if hypothesis.rerendered is not None:
             return Replay(detection, query_rgb, hypothesis.rerendered.rgb, hypothesis)
         crops = context.store.read(self.templates.crops(answer.obj_id))

@@ -44,12 +44,18 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """One detection: features and mask of its crop, A_crop_img and the image's K. ``truth`` is set for oracles only."""
+    """One detection: features and mask of its crop, A_crop_img and the image's K. ``truth`` is set for oracles only.
+
+    ``others``: the same detection with further guesses at its mask, each made when it is asked for; None where its mask
+    is given. ``rgb``: the crop of such a guess; None for that of the first, which is stored.
+    """
 
     crop: CropFeatures
     A_crop_img: Float[np.ndarray, "3 3"]
     K: Float[np.ndarray, "3 3"]
     truth: Truth | None = None
+    others: Callable[[], Iterator[Query]] | None = None
+    rgb: UInt8[np.ndarray, "S S 3"] | None = None
     memo: Memo = field(default_factory=Memo, init=False, repr=False)
 
     @property
@@ -185,12 +191,14 @@ class Hypothesis:
 @dataclass(frozen=True, eq=False)
 class Trace:
     """What the route computed for one detection: the matched templates, one hypothesis for each, and the seconds of
-    each stage. Hypotheses are sorted by score, the best first; the first is refined.
+    each stage. Hypotheses are sorted by score, the best first; the first is refined. ``query``: the detection with the
+    mask that they come from; None where it had only one.
     """
 
     match: TemplateMatch
     hypotheses: tuple[Hypothesis, ...]
     times_s: Mapping[str, float]
+    query: Query | None = None
 
     @property
     def best(self) -> Hypothesis:

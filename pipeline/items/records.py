@@ -49,8 +49,11 @@ def answer_from_record(record: Mapping[str, Any]) -> Answer:
 
 
 def detection_to_record(detection: Detection) -> dict[str, Any]:
-    """A detection's fields; the box as a list."""
-    return asdict(detection) | {"bbox_xyxy": list(detection.bbox_xyxy)}
+    """A detection's fields; the box as a list, ``guessed`` only where it is true."""
+    record = asdict(detection) | {"bbox_xyxy": list(detection.bbox_xyxy)}
+    if not detection.guessed:
+        del record["guessed"]
+    return record
 
 
 def detection_from_record(record: Mapping[str, Any]) -> Detection:

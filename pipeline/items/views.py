@@ -77,7 +77,8 @@ class Detection:
     ``bbox_xyxy``: edges in pixels; pixel i covers [i - 0.5, i + 0.5], so a mask of columns 3 to 5 spans 2.5 to 5.5.
     ``rle``: COCO compressed RLE of the mask in the full image ({"size": [h, w], "counts": str}), None for a box only.
     ``gt_id``: index in scene_gt.json of the instance, for detections made from ground truth. ``defect``: why it cannot
-    be used, determined when it is read; such a detection becomes a NoEstimate.
+    be used, determined when it is read; such a detection becomes a NoEstimate. ``guessed``: its mask was made from its
+    box.
     """
 
     scene_id: int
@@ -89,6 +90,7 @@ class Detection:
     rle: dict[str, Any] | None = None
     gt_id: int | None = None
     defect: str | None = None
+    guessed: bool = False
 
 
 @dataclass(frozen=True)

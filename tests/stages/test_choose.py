@@ -105,3 +105,22 @@ def test_inliers_decide_between_poses_that_agree_alike():
 def test_a_negative_power_is_refused():
     with pytest.raises(BadInput, match=r"choose.inlier_power: found -1.0, needs greater than or equal to 0"):
         build(Agreement, {"inlier_power": -1.0}, where="choose")
+
+
+def test_a_power_of_the_cosine_weighs_similarity_against_inliers():
+    noisy = pair_of(square())
+    half = torch.randn(8, CELLS, CELLS, generator=torch.Generator().manual_seed(1))
+    similar = PairGeometry(noisy, points(), K_CROP, SIZE)
+    unlike = PairGeometry(
+        FusedPair(noisy.query, noisy.template + half, noisy.query_mask, noisy.template_mask), points(), K_CROP, SIZE
+    )
+    for power, choice in ((1.0, "unlike"), (2.0, "similar")):
+        spec = Agreement(cosine_power=power)
+        scores = {"similar": spec(pose(), 20, similar), "unlike": spec(pose(), 50, unlike)}
+        assert max(scores, key=scores.__getitem__) == choice, scores
+
+
+def test_the_power_of_the_cosine_is_left_out_of_keys_at_its_earlier_value():
+    assert Agreement().recipe() == Agreement(cosine_power=1.0).recipe()
+    assert "cosine_power" not in Agreement().recipe()
+    assert Agreement(cosine_power=2.0).recipe()["cosine_power"] == 2.0

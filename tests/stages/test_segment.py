@@ -67,6 +67,16 @@ def test_the_box_stays_where_hardly_anything_is_found():
     assert Grabcut()(photograph(speck), (30.5, 20.5, 130.5, 110.5)) is None
 
 
+def test_further_guesses_are_another_cut_and_the_ellipse_in_the_box():
+    mask = disc()
+    first, second = Grabcut().others(photograph(mask), mask_bbox(mask))
+    assert iou(first, mask) > 0.9
+    assert iou(second, mask) > 0.95
+    assert len(list(Grabcut(guesses=2).others(photograph(mask), mask_bbox(mask)))) == 1
+    assert list(Grabcut(guesses=1).others(photograph(mask), mask_bbox(mask))) == []
+    assert list(NoSegmentation().others(photograph(mask), mask_bbox(mask))) == []
+
+
 def test_none_leaves_every_box():
     assert NoSegmentation()(photograph(disc()), mask_bbox(disc())) is None
 

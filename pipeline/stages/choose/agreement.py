@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -10,13 +11,13 @@ from jaxtyping import Float
 from pipeline.functional.agreement import agreement
 from pipeline.functional.camera import cell_affine
 from pipeline.items.features import PairGeometry
-from pipeline.spec import NonNegativeFloat, spec
+from pipeline.spec import NonNegativeFloat, PositiveFloat, spec
 from pipeline.stages.choose import HypothesisScorer
 
 
 @spec
 class Agreement(HypothesisScorer):
-    """Mean cosine times coverage times inliers to the power of ``inlier_power``.
+    """Mean cosine to the power of ``cosine_power``, times coverage, times inliers to the power of ``inlier_power``.
 
     The template's cells are projected into the query under the pose: the mean cosine compares their descriptors with
     the query's at those places, coverage is the share of the query's foreground that they reach
@@ -26,8 +27,10 @@ class Agreement(HypothesisScorer):
 
     kind: ClassVar[str] = "choose.agreement"
     version: ClassVar[int] = 1
+    added: ClassVar[Mapping[str, Any]] = {"cosine_power": 1.0}
 
     inlier_power: NonNegativeFloat = 0.5
+    cosine_power: PositiveFloat = 1.0
 
     def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
         """The product; 0 where the template lands outside the query's foreground."""
@@ -36,4 +39,4 @@ class Agreement(HypothesisScorer):
         cosine, coverage = agreement(
             pair.query, pair.template, pair.query_mask, pair.template_mask, geometry.points_obj, K_cell, T_cam_obj
         )
-        return max(cosine, 0.0) * coverage * inliers**self.inlier_power
+        return max(cosine, 0.0) ** self.cosine_power * coverage * inliers**self.inlier_power

@@ -25,7 +25,7 @@ class Solver(Spec, ABC):
 
     ``plane``: the pixel frame that its threshold is measured in. ``crop``: a threshold is the same share of every
     object, near or far. ``image``: pixels of the full image, scaled down where the crop is larger than 160 of them, so
-    that a photograph of many megapixels does not make the threshold finer than the features (route.solver_plane).
+    that a photograph of many megapixels does not make the threshold finer than the features (solve.plane).
     """
 
     plane: Plane = "image"

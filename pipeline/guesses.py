@@ -1,0 +1,61 @@
+"""A detection whose mask is a guess: poses with each guess until one convinces, then the best."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
+
+from pipeline.errors import NoPose
+from pipeline.hypotheses import mean_cosine
+from pipeline.items.online import Clock, Query, TemplateBank, Trace
+from pipeline.method import Stages
+from pipeline.route import Route, trace_pose
+
+
+def trace_guesses(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
+    """The trace of the guess whose best pose has most similar cells among its inliers: mean cosine times their number.
+
+    No guess is made after one whose mean cosine is enough (Segmenter.is_enough). The seconds are those of all guesses.
+    Raises NoPose, that of the first, where no guess can be compared with a template.
+    """
+    if query.others is None:
+        return trace_pose(stages, query, bank)
+    found: list[tuple[float, Trace]] = []
+    failure, clock = None, Clock()
+    for guess in chain([query], _timed(query.others(), clock)):
+        try:
+            trace = trace_pose(stages, guess, bank)
+        except NoPose as reason:
+            failure = failure or reason
+            continue
+        similarity = _similarity(stages, guess, bank, trace)
+        found.append((similarity * trace.best.inliers, replace(trace, query=guess)))
+        if stages.segment.is_enough(similarity):
+            break
+    if not found:
+        raise failure or NoPose("match", "no guess at the mask")
+    seconds = Counter(clock.times_s)
+    for _, trace in found:
+        seconds.update(trace.times_s)
+    best = max(found, key=lambda each: each[0])[1]
+    return replace(best, times_s=dict(seconds))
+
+
+def _similarity(stages: Stages, guess: Query, bank: TemplateBank, trace: Trace) -> float:
+    """Mean cosine of the best hypothesis; -1 without a pose."""
+    if trace.best.pair is None:
+        return -1.0
+    route = Route(stages, guess, bank)
+    return mean_cosine(trace.best, route.geometry(route.view(trace.best), trace.best.pair))
+
+
+def _timed(guesses: Iterator[Query], clock: Clock) -> Iterator[Query]:
+    """The guesses, with the seconds of making them."""
+    while True:
+        with clock("guess mask"):
+            guess = next(guesses, None)
+        if guess is None:
+            return
+        yield guess
