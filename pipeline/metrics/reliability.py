@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import rankdata
 
 BINS = 10
 RIGHT = 0.2
@@ -42,4 +41,6 @@ def ranking_auc(confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n
     positive, negative = int(right.sum()), int((~right).sum())
     if not positive or not negative:
         return float("nan")
+    from scipy.stats import rankdata  # slow to import, and most commands score nothing
+
     return float((rankdata(confidence)[right].sum() - positive * (positive + 1) / 2) / (positive * negative))
