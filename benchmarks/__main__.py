@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from benchmarks.rendering import rendering
 from benchmarks.startup import startup
 from benchmarks.storing import storing
 from benchmarks.workers import two_workers
+from pipeline.errors import DzopError
 from pipeline.io.files import write_json
 from pipeline.parallel import use_threads
 
@@ -73,15 +75,21 @@ def main() -> None:
     cv2.setNumThreads(args.threads)
     description = describe_machine(args.device)
     print(json.dumps(description), flush=True)
-    measurements: list[Measurement] = []
+    measurements, failed = list[Measurement](), list[str]()
     for name in args.parts or [part for part in PARTS if part not in ON_REQUEST]:
-        found = PARTS[name](device=args.device, repeats=args.repeats, **options.get(name, {}))
+        try:
+            found = PARTS[name](device=args.device, repeats=args.repeats, **options.get(name, {}))
+        except DzopError as error:
+            failed.append(f"{name}: {error}")
+            continue
         print(f"\n{name}\n{table(found)}", flush=True)
         measurements += found
     with_target = [m for m in measurements if m.target is not None]
     print(f"\ntargets: {sum(m.verdict == 'pass' for m in with_target)} of {len(with_target)} met\n{table(with_target)}")
     write_json(args.json, {"machine": description, "figures": [m.to_record() for m in measurements]})
     print(f"written   {args.json}")
+    if failed:
+        sys.exit("\n".join(f"error: not measured: {reason}" for reason in failed))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.errors import BadInput, DzopError
+
 ROOT = Path(__file__).resolve().parents[1]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")
 QUIET = ("overlays=false", "gallery=0", "runtime.progress=false", "evaluate.vsd=false")
@@ -39,7 +41,7 @@ class Usage:
 
 
 def run_dzop(folder: Path, *overrides: str, checkout: Path = ROOT, threads: int = 1, **environment: str) -> Usage:
-    """Run ``dzop`` with data, cache and results below ``folder``. Raises CalledProcessError with its output."""
+    """Run ``dzop`` with data, cache and results below ``folder``. Raises DzopError with its last line."""
     places = [f"{name}={folder / place}" for name, place in _PLACES.items() if not _is_set(name, overrides)]
     with tempfile.TemporaryDirectory() as name:
         usage = Path(name) / "usage.json"
@@ -47,8 +49,8 @@ def run_dzop(folder: Path, *overrides: str, checkout: Path = ROOT, threads: int 
         variables = os.environ | ONE_THREAD | {"PYTHONPATH": str(checkout)} | environment
         done = subprocess.run(command, cwd=checkout, env=variables, capture_output=True, text=True)
         if done.returncode:
-            print(done.stderr[-2000:], file=sys.stderr)
-            raise subprocess.CalledProcessError(done.returncode, ["dzop", *overrides], done.stdout, done.stderr)
+            reason = (done.stderr.strip() or f"status {done.returncode}").splitlines()[-1]
+            raise DzopError(f"dzop {' '.join(overrides)} in {checkout}: {reason}")
         return Usage(**json.loads(usage.read_text()))
 
 
@@ -61,11 +63,14 @@ def _is_set(name: str, overrides: tuple[str, ...]) -> bool:
 
 @contextmanager
 def checkout_of(revision: str) -> Iterator[Path]:
-    """A git worktree of a revision, removed afterwards. Raises CalledProcessError for an unknown revision."""
+    """A git worktree of a revision, removed afterwards. Raises BadInput for an unknown one."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "before"
         git = ["git", "-C", str(ROOT), "worktree"]
-        subprocess.run([*git, "add", "--quiet", "--detach", str(path), revision], check=True)
+        try:
+            subprocess.run([*git, "add", "--quiet", "--detach", str(path), revision], check=True, capture_output=True)
+        except (OSError, subprocess.CalledProcessError):
+            raise BadInput("--before", found=repr(revision), needed="a commit of this git checkout") from None
         try:
             yield path
         finally:

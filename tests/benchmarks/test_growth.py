@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.cli_runs import checkout_of, run_dzop
 from benchmarks.growth import _plot, _summarise, enlarge_photographs
+from pipeline.errors import BadInput, DzopError
 
 
 def test_enlarged_photographs_keep_their_camera_and_boxes(tmp_path):
@@ -34,3 +36,11 @@ def test_growth_is_compared_with_linear_growth(tmp_path):
     assert found["objects: peak memory"].value == pytest.approx(1.1)
     _plot("objects", (1, 10), (0.5, 2.5), (300, 330)).save(str(tmp_path / "objects"))
     assert (tmp_path / "objects.png").stat().st_size > 1000
+
+
+def test_an_unknown_commit_and_a_failed_run_are_one_line(tmp_path):
+    needed = "--before: found 'no-such-commit', needs a commit of this git checkout"
+    with pytest.raises(BadInput, match=needed), checkout_of("no-such-commit"):
+        pass
+    with pytest.raises(DzopError, match=r"dzop datset=demo in .*: .*"):
+        run_dzop(tmp_path, "datset=demo")
