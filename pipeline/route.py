@@ -32,7 +32,7 @@ from pipeline.method import Stages
 from pipeline.stages.cluster import require_cells
 from pipeline.stages.fuse import coarsen_pair, encode_view
 from pipeline.stages.lift import lift
-from pipeline.stages.solve.plane import solver_plane
+from pipeline.stages.solve.plane import refit_in_crop, solver_plane
 
 MIN_POINTS = 4
 
@@ -183,6 +183,7 @@ class Route:
         inliers = np.zeros(len(on_object), bool)
         inliers[on_object] = solution.inliers
         T_cam_obj = pose_in_image(solution.T_cam_obj, R_plane_cam)
+        T_cam_obj = refit_in_crop(self.stages.solve, query, points_obj[on_object], query_px_img[on_object], T_cam_obj)
         error_px = reprojection_error_px(points_obj[inliers], query_px_img[inliers], query.K, T_cam_obj)
         return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px**2))))
 

@@ -157,3 +157,28 @@ def test_options_out_of_range_name_the_field():
         build(Epnp, {"confidence": 1.0}, where="solve")
     with pytest.raises(BadInput, match=r"solve.min_inliers: found 3, needs greater than or equal to 4"):
         build(Epnp, {"min_inliers": 3}, where="solve")
+
+
+def test_refitting_trusts_near_matches_more_than_those_at_the_threshold():
+    points, rng = _points(), np.random.default_rng(4)
+    px = _observed(points, noise=0.3)
+    px[:60] += rng.uniform(1.5, 4.0, (60, 2))  # wrong by less than the threshold, all to one side
+    solved = Poselib(threshold_px=5.0)(points, px, K).T_cam_obj
+
+    def off_mm(found: np.ndarray) -> float:
+        return float(np.linalg.norm(transform(found, points) - transform(T, points), axis=1).max())
+
+    refitted = Poselib(refit_px=0.7).refit(points, px, K, solved)
+    assert off_mm(refitted) < 0.5 * off_mm(solved)
+
+
+@pytest.mark.parametrize("solve", [Epnp(), Poselib(), Poselib(refit_px=0.01)], ids=["epnp", "off", "no match is near"])
+def test_without_a_loss_or_near_matches_the_pose_stays(solve):
+    points = _points()
+    px = _observed(points) + 5.0
+    assert np.array_equal(solve.refit(points, px, K, T), T)
+
+
+def test_refitting_is_left_out_of_keys_where_it_is_off():
+    assert "refit_px" not in Poselib().recipe()
+    assert Poselib(refit_px=1.0).recipe()["refit_px"] == 1.0

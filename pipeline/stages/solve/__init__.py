@@ -39,6 +39,16 @@ class Solver(Spec, ABC):
     ) -> PoseSolution:
         """T_cam_obj (mm) from pixels of the camera K. Raises NoPose when no pose is supported by enough inliers."""
 
+    def refit(
+        self,
+        points_obj: Float[np.ndarray, "m 3"],
+        px_crop: Float[np.ndarray, "m 2"],
+        K_crop: Float[np.ndarray, "3 3"],
+        T_crop_obj: Float[np.ndarray, "4 4"],
+    ) -> Float[np.ndarray, "4 4"]:
+        """The solution with the precision of the features, a matter of the crop's pixels; by default unchanged."""
+        return T_crop_obj
+
 
 @spec
 class RansacSolver(Solver):

@@ -1,13 +1,14 @@
-"""The pixel frame that a solver's threshold is measured in."""
+"""The pixel frames that a solver's threshold is measured in, and in which its pose is refitted."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.functional import camera
+from pipeline.functional import camera, rigid
+from pipeline.functional.crop_pose import pose_in_image
 from pipeline.items.online import Query
-from pipeline.stages.solve import Plane
+from pipeline.stages.solve import Plane, Solver
 
 LARGEST_CROP_PX = 160  # side, in image pixels, of the largest crop whose solver threshold is in image pixels
 
@@ -26,3 +27,17 @@ def solver_plane(
     side_px = crop_size / float(camera.local_zoom(query.A_crop_img, centre)[0])
     A_plane_img = camera.resize_affine(min(1.0, LARGEST_CROP_PX / side_px))
     return A_plane_img, A_plane_img @ query.K, np.eye(3)
+
+
+def refit_in_crop(
+    solver: Solver,
+    query: Query,
+    points_obj: Float[np.ndarray, "m 3"],
+    px_img: Float[np.ndarray, "m 2"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "4 4"]:
+    """T_cam_obj refitted to object points and pixels of the photograph, in the crop's camera (Solver.refit)."""
+    K_crop, R_crop_cam = camera.crop_camera(query.A_crop_img, query.K)
+    px_crop = camera.apply_homography(query.A_crop_img, px_img)
+    T_crop_obj = rigid.rigid(R_crop_cam, np.zeros(3)) @ T_cam_obj
+    return pose_in_image(solver.refit(points_obj, px_crop, K_crop, T_crop_obj), R_crop_cam)
