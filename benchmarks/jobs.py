@@ -21,9 +21,8 @@ from pipeline.store import Store
 SMALL = ("dataset=demo", "dataset.objects=15", "dataset.images=8", "dataset.per_image=3", "evaluate.vsd=false")
 QUIET = ("overlays=false", "gallery=0", "runtime.progress=false")
 FEW, MANY = 4, 16
-_LARGE_BLOCK = (
-    "1000000"  # glibc returns larger ones at once: peaks are of what is in use, not of how the heap is divided
-)
+# glibc returns blocks of at least these bytes at once: peaks are of what is in use, not of how the heap is divided
+_LARGE_BLOCK = "131072"
 
 
 def job(folder: Path, *overrides: str) -> None:
