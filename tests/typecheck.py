@@ -13,9 +13,14 @@ from typing import Any, get_args, get_type_hints
 
 import jaxtyping
 from beartype import BeartypeConf, beartype
-from jaxtyping import AbstractArray, install_import_hook
+from jaxtyping import AbstractArray, TypeCheckError, install_import_hook
 
-_BEARTYPE = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, as for mypy
+_BEARTYPE = beartype(
+    conf=BeartypeConf(
+        is_pep484_tower=True,  # an int is a float, as for mypy
+        violation_type=TypeCheckError,  # a TypeError, as code raises that finds another type by itself
+    )
+)
 _WITH_SHAPES = jaxtyping.jaxtyped(typechecker=None)
 
 
