@@ -28,7 +28,7 @@ from benchmarks.accuracy import path_override
 from benchmarks.run_pool import run_all
 from benchmarks.validation import Case, read_cases, write_validation
 from pipeline.bop.dataset import open_dataset
-from pipeline.confidence.calibration import SHIPPED, Calibration, Term, identify_stages
+from pipeline.confidence.calibration import SHIPPED, Calibration, Term, identify_settings, identify_variants
 from pipeline.configuration import CONF, build_stages
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.files import write_json
@@ -233,7 +233,7 @@ def coverage_table(confidence: Float[np.ndarray, " n"], examples: Sequence[Examp
 def benchmark(folder: Path, out: Path, overrides: Sequence[str]) -> str:
     """Fit on the seeds for fitting, measure on those for testing, write the calibration; returns tables in Markdown."""
     stages = _stages(overrides)
-    kinds, recipes = identify_stages(stages)
+    kinds, recipes = identify_variants(stages), identify_settings(stages)
     fitting = [e for seed in FIT_SEEDS for e in collect(folder, seed, overrides)]
     testing = [e for seed in TEST_SEEDS for e in collect(folder, seed, overrides)]
     command = " ".join(["python -m benchmarks.confidence", *overrides])

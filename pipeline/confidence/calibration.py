@@ -125,7 +125,7 @@ def choose_calibration(stages: Stages, choice: str) -> Calibration | None:
     """
     if choice == "none":
         return None
-    kinds, _ = identify_stages(stages)
+    kinds = identify_variants(stages)
     if choice != "auto":
         chosen = read_calibration(Path(choice).expanduser())
         if other := [name for name in kinds if chosen.kinds.get(name) != kinds[name]]:
@@ -136,13 +136,16 @@ def choose_calibration(stages: Stages, choice: str) -> Calibration | None:
     return next((calibration for calibration in shipped if calibration.kinds == kinds), None)
 
 
-def identify_stages(stages: Stages) -> tuple[dict[str, str], dict[str, str]]:
-    """Kind, and digest of the recipe, of every stage that a calibration belongs to."""
-    parts = {name: getattr(stages, name) for name in CALIBRATED_STAGES}
-    kinds = {name: part.kind for name, part in parts.items()}
-    kinds["second look"] = "drawn" if stages.second_look.hypotheses else "none"
-    recipes = {name: digest(part.recipe()) for name, part in parts.items()}
-    return kinds, recipes | {"second look": digest(stages.second_look.recipe())}
+def identify_variants(stages: Stages) -> dict[str, str]:
+    """Kind of every stage that a calibration belongs to. Reads no weights."""
+    kinds = {name: getattr(stages, name).kind for name in CALIBRATED_STAGES}
+    return kinds | {"second look": "drawn" if stages.second_look.hypotheses else "none"}
+
+
+def identify_settings(stages: Stages) -> dict[str, str]:
+    """Digest of the recipe of every stage that a calibration belongs to. Raises NotDownloaded."""
+    recipes = {name: digest(getattr(stages, name).recipe()) for name in CALIBRATED_STAGES}
+    return recipes | {"second look": digest(stages.second_look.recipe())}
 
 
 def describe_confidence(stages: Stages, calibration: Calibration | None, choice: str) -> str:
@@ -152,7 +155,7 @@ def describe_confidence(stages: Stages, calibration: Calibration | None, choice:
     refit = "python -m benchmarks.confidence fits one"
     if calibration is None:
         return f"poses have no confidence: none was fitted for this method and these features; {refit}"
-    _, recipes = identify_stages(stages)
+    recipes = identify_settings(stages)
     other = [name for name, recipe in recipes.items() if calibration.recipes.get(name) != recipe]
     if not other:
         return ""

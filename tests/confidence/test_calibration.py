@@ -9,7 +9,8 @@ from pipeline.confidence.calibration import (
     Term,
     choose_calibration,
     describe_confidence,
-    identify_stages,
+    identify_settings,
+    identify_variants,
     read_calibration,
 )
 from pipeline.configuration import build_stages
@@ -79,7 +80,7 @@ def test_file_is_read_back_and_a_wrong_one_is_refused(tmp_path):
 
 def test_calibration_belongs_to_the_variants_of_a_method(tmp_path):
     stages = stages_of("extract=pixels")
-    kinds, recipes = identify_stages(stages)
+    kinds, recipes = identify_variants(stages), identify_settings(stages)
     path = tmp_path / "pixels.json"
     path.write_text(json.dumps(asdict(calibration(kinds=kinds, recipes=recipes))))
     chosen = choose_calibration(stages, str(path))
