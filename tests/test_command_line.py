@@ -460,7 +460,7 @@ def test_cache_commands_list_measure_verify_and_clean(dzop):
 
 def test_help_shows_examples_the_variants_and_where_the_rest_is(capsys, monkeypatch):
     shown = run_dzop(capsys, monkeypatch, "--help").out
-    for line in ("dzop fetch, reproduce, cache", "match: cosine, masked_cosine, oracle, words", "--cfg job"):
+    for line in ("dzop doctor, fetch, reproduce, cache", "match: cosine, masked_cosine, oracle, words", "--cfg job"):
         assert line in shown
     examples = shown.split("Examples:")[1].split("Other commands")[0]
     assert len([line for line in examples.splitlines() if line.startswith("  dzop")]) == 5

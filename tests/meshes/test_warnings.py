@@ -90,10 +90,10 @@ def test_a_cached_run_says_what_the_first_one_said(name, dzop, tmp_path, monkeyp
     write, text = CASES[name]
     mesh = write(tmp_path)
     planned = dzop(mesh, "plan=true")
-    assert f"warning: mesh of object 1: {text}" in planned.out, planned.err
+    assert f"warning: mesh of {mesh.stem}: {text}" in planned.out, planned.err
     first = dzop(mesh)
     assert first.status == 0, first.err
-    assert f"warning: mesh of object 1: {text}" in first.out
+    assert f"warning: mesh of {mesh.stem}: {text}" in first.out
     said = recorded()
     assert any(text in warning for warning in said)
     with monkeypatch.context() as patch:
@@ -101,7 +101,7 @@ def test_a_cached_run_says_what_the_first_one_said(name, dzop, tmp_path, monkeyp
         second = dzop(mesh)
     assert second.status == 0, second.err
     assert second.counts()[0]["templates"][0] == 0
-    assert f"warning: mesh of object 1: {text}" in second.out
+    assert f"warning: mesh of {mesh.stem}: {text}" in second.out
     assert recorded() == said
 
 
