@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -42,7 +42,6 @@ class Photographs:
                 data.object_name(answer.obj_id),
                 mesh=str(data.model_path(answer.obj_id)),
                 image=images[answer.scene_id, answer.im_id],
-                model=context.model(answer.obj_id),
                 warnings=self.warnings,
             )
             for answer in self.answers
@@ -60,7 +59,7 @@ class Photographs:
             wanted = ["pose.json", *(["overlay.jpg", "pose.html"] if overlays else [])]
             if not _holds(folder, wanted, more["made_from"]):
                 save_results(
-                    [self.results[index] for index in indices],
+                    [self._with_model(index) for index in indices],
                     folder,
                     image=str(data.image_path(*image)),
                     more=more,
@@ -83,6 +82,10 @@ class Photographs:
             if result.found:
                 lines.append(f"  {result.inliers} of {result.correspondences} matches agree{result.details()}")
         return "\n".join(lines)
+
+    def _with_model(self, index: int) -> PoseResult:
+        """A result that can be drawn. The mesh is read only for that: a cached run draws nothing."""
+        return replace(self.results[index], model=self.folder.context.model(self.answers[index].obj_id))
 
     def _folder_name(self, image: ImageId) -> str:
         """The photograph's name without its suffix; with a number where another one has the same."""

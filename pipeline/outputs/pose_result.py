@@ -111,9 +111,15 @@ class PoseResult:
 
 
 def result_of(
-    answer: Answer, name: str, *, mesh: str, image: Image, model: ObjectModel, warnings: Sequence[str] = ()
+    answer: Answer,
+    name: str,
+    *,
+    mesh: str,
+    image: Image,
+    model: ObjectModel | None = None,
+    warnings: Sequence[str] = (),
 ) -> PoseResult:
-    """The result of an answer."""
+    """The result of an answer; it can be drawn with the object's model."""
     if isinstance(answer, NoEstimate):
         stage, reason = answer.stage, answer.reason
         about = tuple(warnings)
