@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import cache
+from pathlib import Path
 from typing import Any, cast, get_origin, get_type_hints
 
 from hydra import compose, initialize_config_dir
@@ -68,22 +70,35 @@ def build_stages(values: Mapping[str, Any]) -> Stages:
 
 
 def drop_replaced_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration without a method's fields for a variant that ``variation=`` replaces by one without them.
+    """The configuration without a method's fields for a variant that was replaced by one without them.
 
-    With ``variation=no_clusters``, say, ``method=dzop_paper`` sets ``cluster.planar``, which only k-means has.
+    With ``solve=epnp``, say, ``method=dzop_x`` sets ``solve.refit_px``, which only its own solver has.
     """
     kept, path = dict(values), CONF / "method" / f"{values.get('method')}.yaml"
-    if values.get("variation", "none") == "none" or not path.is_file():
-        return kept
-    by_method = OmegaConf.to_container(OmegaConf.load(path))
+    by_method = _read_yaml(path) if path.is_file() else {}
     for stage in STAGES:
-        given = by_method.get(stage) if isinstance(by_method, dict) else None
-        variant = values.get(stage)
-        if isinstance(given, dict) and isinstance(variant, Mapping):
+        given, variant = by_method.get(stage), values.get(stage)
+        if not isinstance(given, dict) or not isinstance(variant, Mapping):
+            continue
+        if variant.get("_target_") != _target_of_method(by_method, stage):
             names = {field.name for field in fields(_find_class(variant.get("_target_"), f"{stage}._target_"))}
             replaced = {name for name in given if name not in names and variant.get(name) == given[name]}
             kept[stage] = {name: value for name, value in variant.items() if name not in replaced}
     return kept
+
+
+def _target_of_method(by_method: Mapping[str, Any], stage: str) -> Any:
+    """``_target_`` of the variant that a method's yaml chooses, or of the default one where it chooses none."""
+    defaults = [entry for entry in _read_yaml(CONF / "config.yaml")["defaults"] if isinstance(entry, dict)]
+    chosen = {name: value for entry in defaults for name, value in entry.items()}
+    for entry in by_method.get("defaults", ()):
+        chosen |= {name.removeprefix("override /"): value for name, value in entry.items()}
+    return _read_yaml(CONF / stage / f"{chosen[stage]}.yaml").get("_target_")
+
+
+@cache
+def _read_yaml(path: Path) -> Any:
+    return OmegaConf.to_container(OmegaConf.load(path))
 
 
 def build_options(values: Mapping[str, Any], *, resume: bool = False) -> Options:

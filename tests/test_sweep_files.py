@@ -60,6 +60,18 @@ def test_a_variation_takes_the_fields_of_what_it_replaces_with_it(method, name):
     assert {stage: set(kept[stage]) for stage in STAGES} == {stage: set(recorded[stage]) for stage in STAGES}
 
 
+@pytest.mark.parametrize("replaced", ["solve=epnp", "choose=inliers"])
+def test_a_variant_chosen_by_the_user_loses_the_methods_fields_for_another_one(replaced):
+    stages = build_stages(composed("method=dzop_x", replaced))
+    stage, name = replaced.split("=")
+    assert getattr(stages, stage).kind == f"{stage}.{name}"
+
+
+def test_a_wrong_field_of_the_methods_own_variant_stays_an_error():
+    with pytest.raises(BadInput, match=r"solve.refit: found an unknown field"):
+        build_stages(composed("method=dzop_x", "+solve.refit=2.0"))
+
+
 def test_other_fields_that_a_variant_lacks_stay_an_error():
     config = composed("method=dzop_paper", "variation=no_clusters", "+cluster.seeds=3")
     with pytest.raises(BadInput, match=r"cluster.seeds: found an unknown field"):
