@@ -122,6 +122,7 @@ def test_a_killed_worker_is_reported_in_one_line_and_a_rerun_resumes(command, st
     sweep = start(jobs)
     wait_for(rows, 1)
     workers = [p for p in psutil.Process(sweep.pid).children() if any("popen_loky" in word for word in p.cmdline())]
+    time.sleep(0.3)  # into the next job: loky waits for ever for a worker that dies while it sends a result
     workers[0].kill()
     _, err = sweep.communicate(timeout=300)
     assert sweep.returncode == 1
