@@ -1,4 +1,4 @@
-"""This checkout compared with an earlier commit: both run the same commands in turn, under the same load."""
+"""Compare this checkout with an earlier commit: both run the same commands alternately, under the same load."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _VIEWS = 40
 def compare_with_before(
     *, device: str, repeats: int, revision: str = "HEAD~1", lmo: Path | None = None
 ) -> list[Measurement]:
-    """Milliseconds a pose with onboarded templates and a view of onboarding, seconds and memory of a cached run.
+    """Milliseconds per pose with onboarded templates and per onboarded view, seconds of a cached run, and memory.
 
-    ``lmo``: poses in 20 photographs of LM-O instead of the demo's. What a command takes when all is cached, its start,
-    is subtracted from poses and views. Results change with ``solve.seed``, so each round computes its poses anew.
+    ``lmo``: estimate poses in 20 photographs of LM-O instead of the demo's. The time of a cached run is subtracted from
+    poses and views. Every round has its own ``solve.seed``, so its poses are not cached.
     """
     data = DEMO if lmo is None else ("dataset=lmo", f"dataset.root={lmo}", "select.sample=20")
     title = "the demo" if lmo is None else "20 images of LM-O"

@@ -1,10 +1,10 @@
-"""Fit the confidence of a method's poses on procedural scenes, and measure it on scenes of seeds never used to fit.
+"""Fit the confidence of a method's poses on procedural scenes, and measure it on scenes of other seeds.
 
     python -m benchmarks.confidence                              # the default method; writes the file that ships
     python -m benchmarks.confidence method=dzop --out dzop.json  # another method; use it with confidence=dzop.json
 
-A pose is right where its MSSD is below 20 % (and 10 %) of the diameter. Detections are those of an imitated detector;
-a part of them asks for an object that is not in the image. Prints tables in Markdown. Runs are cached.
+A pose is right if its MSSD is below 20 % (or 10 %) of the diameter. Detections are those of a simulated detector; some
+are of an object that is not in the image. Prints tables in Markdown. Runs are cached.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ VIEWS = 300
 LIMITS = (0.2, 0.1)
 """Of the diameter: a pose with a smaller MSSD is right."""
 ACCEPT_FROM, REJECT_BELOW = 0.9, 0.2
-"""Confidences that decide. A threshold fitted to a share of right poses does not hold on other seeds."""
+"""Thresholds of the decision, fixed: one fitted to a share of right poses does not hold on other seeds."""
 TERMS = (
     ("inliers", "log", 1),
     ("inlier_ratio", "linear", 1),
@@ -61,14 +61,14 @@ TERMS = (
     ("template_margin", "log", 1),
     ("crop_px", "log", 1),
 )
-"""Evidence, its transform, and whether more of it speaks for the pose (1) or against it (-1)."""
+"""Name of the evidence, its transform, and the sign of its weight: 1 if larger values speak for the pose, or -1."""
 STRENGTH = 0.3
-"""Of the fit's freedom, as C of scikit-learn's LogisticRegression; chosen by cross-validation over objects."""
+"""Inverse of L2 regularisation, as C in scikit-learn's LogisticRegression; cross-validated over objects."""
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A pose with its error over the diameter, infinite where another object's mesh was asked for.
+    """A pose with its error over the diameter, infinite if the detection has another object's mesh.
 
     ``rivals``: the errors of its alternatives.
     """
@@ -80,7 +80,7 @@ class Example:
 
 
 def collect(folder: Path, seed: int, overrides: Sequence[str]) -> list[Example]:
-    """Make the scenes of a seed, estimate poses, and measure them."""
+    """Make the scenes of a seed, estimate poses, and measure their errors."""
     root = folder / "data" / f"{seed}_{OBJECTS}_{IMAGES}"
     if not (root / "cases.json").is_file():
         write_validation(root, seed=seed, objects=OBJECTS, images=IMAGES)
@@ -115,7 +115,7 @@ def _measure(root: Path, records: Sequence[Mapping[str, Any]]) -> list[Example]:
 
 
 def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[str, str], command: str) -> Calibration:
-    """The calibration of a method from its poses."""
+    """Fit the calibration of a method to its poses."""
     available = {name for example in examples for name in example.estimate.evidence}
     chosen = [(name, transform, sign) for name, transform, sign in TERMS if name in available]
     terms = [_standardise(Term(name, transform, 0.0, 1.0, 0.0, 0.0), examples) for name, transform, _ in chosen]
@@ -144,7 +144,7 @@ def fit_signed(
 ) -> Float[np.ndarray, " k+1"]:
     """Bias and weights of a logistic regression whose weights have the given signs or are 0.
 
-    A weight of the other sign would only say how the scenes of the fit differ from others.
+    A weight of the other sign would fit peculiarities of the training scenes.
     """
     y = np.where(correct, 1.0, -1.0)
 
@@ -169,7 +169,7 @@ def _values(terms: Sequence[Term], examples: Sequence[Example]) -> Float[np.ndar
 
 
 def _share_of_rivals(examples: Sequence[Example]) -> float:
-    """Among wrong poses that have alternatives, the share that have the right pose among them."""
+    """The share of wrong poses with alternatives that have the right pose among these."""
     wrong = [e for e in examples if e.error >= LIMITS[0] and e.rivals]
     return round(float(np.mean([any(rival < LIMITS[0] for rival in e.rivals) for e in wrong])), 3) if wrong else 0.0
 
@@ -180,12 +180,12 @@ def right(examples: Sequence[Example], limit: float = LIMITS[0]) -> Bool[np.ndar
 
 
 def confidences(calibration: Calibration, examples: Sequence[Example]) -> Float[np.ndarray, " n"]:
-    """Confidence of each pose; 0 where it is unknown."""
+    """Confidence of each pose; 0 if unknown."""
     return np.array([calibration.apply(e.estimate).confidence or 0.0 for e in examples])
 
 
 def measure(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], accept: float) -> dict[str, float]:
-    """AUC of all poses and of those of the right mesh, calibration error, and what is accepted."""
+    """AUC of all poses and of those with the right mesh, calibration error, and shares of accepted poses."""
     correct, true_mesh = right(examples), np.array([e.case.T_cam_obj is not None for e in examples])
     chosen = confidence >= accept
     old = np.array([e.estimate.score for e in examples])
@@ -206,7 +206,7 @@ def measure(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], ac
 
 
 def coverage_table(confidence: Float[np.ndarray, " n"], examples: Sequence[Example], accept: float) -> str:
-    """Markdown: what is right and accepted by visible fraction, poses of the right mesh."""
+    """A Markdown table: shares of right and accepted poses by visible fraction, for the right mesh."""
     lines = ["| visible | poses | right | accepted | right among accepted |", "|---" * 5 + "|"]
     for low, high in ((0.0, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.01)):
         at = np.array([e.case.T_cam_obj is not None and low <= e.case.visible < high for e in examples])

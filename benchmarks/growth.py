@@ -1,7 +1,7 @@
 """How the cost of poses grows with templates, detections in an image, objects, and the size of the photographs.
 
-Every point is a run of the command line in a process of its own. Its templates are onboarded, so it computes query
-features and poses. Where not templates but something else grows, crops are compared as pixels, which costs little.
+Every point is a run of the command line in its own process, with templates onboarded before, so that it computes query
+features and poses only. Except for the growth with templates, features are raw pixels, which cost little.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ Commands = Sequence[tuple[str, ...]]
 
 
 def growth(*, device: str, repeats: int, plots: Path = Path("results/bench")) -> list[Measurement]:
-    """CPU seconds and peak memory at each point, and how much faster than linear, or slower, the time grows.
+    """CPU seconds and peak memory at each point, and the growth of the time relative to linear growth.
 
-    Draws a plot of each into ``plots``.
+    Writes one plot per quantity to ``plots``.
     """
     chosen = (f"runtime.device={device}", "step=estimate")
     measurements: list[Measurement] = []
@@ -57,7 +57,7 @@ def growth(*, device: str, repeats: int, plots: Path = Path("results/bench")) ->
 
 
 def _with_templates(folder: Path, count: float) -> Commands:
-    """Poses of dzop_x; another seed of the solver computes them again."""
+    """Poses of dzop_x; another seed of the solver makes the second run compute them again."""
     size = (*_DEMO, "dataset.objects=1", "dataset.images=4", "dataset.per_image=1", f"render.count={count:g}")
     return size, (*size, "solve.seed=1")
 
@@ -73,7 +73,7 @@ def _with_objects(folder: Path, count: float) -> Commands:
 
 
 def _with_pixels(folder: Path, megapixels: float) -> Commands:
-    """Photographs of the demo, enlarged; another crop reads them again."""
+    """Enlarged photographs of the demo; another crop makes the second run read them again."""
     size = ("dataset.objects=1", "dataset.images=2", "dataset.per_image=1")
     run_dzop(folder, *_DEMO, *size, *_CHEAP, "step=detect")
     (made,) = (folder / "data").iterdir()
@@ -83,7 +83,7 @@ def _with_pixels(folder: Path, megapixels: float) -> Commands:
 
 
 def enlarge_photographs(scene: Path, megapixels: float) -> None:
-    """Scale photographs, masks, boxes and camera matrices of a scene to a number of megapixels; depth is removed."""
+    """Scale photographs, masks, boxes and camera matrices of a scene to this many megapixels; remove depth."""
     cameras, boxes = (json.loads((scene / f"scene_{name}.json").read_text()) for name in ("camera", "gt_info"))
     for path in sorted(scene.glob("*/*.png")) + sorted(scene.glob("*/*.jpg")):
         if path.parent.name == "depth":
@@ -122,7 +122,7 @@ def _summarise(
 
 
 def _plot(what: str, points: Sequence[float], seconds: Sequence[float], peaks: Sequence[float]) -> Figure:
-    """Time and memory over the points, both axes logarithmic, with linear growth from the first point."""
+    """Log-log plot of time and memory over the points, with linear growth from the first point."""
     canvas, axes = one_panel()
     axes.loglog(points, seconds, "o-", color=COLOURS[0], label="s of one core")
     axes.loglog(points, [seconds[0] * p / points[0] for p in points], ":", color=COLOURS[6], label="linear growth")

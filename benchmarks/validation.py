@@ -1,9 +1,9 @@
-"""seed -> procedural scenes that are as hard as photographs: what confidence is fitted and measured on.
+"""seed -> procedural scenes meant to be as hard as photographs, to fit and measure confidence.
 
 Templates are rendered from scan-like meshes (other colours, baked-in light, a smoother and slightly wrong surface, or
-no colours at all); photographs show the true objects, and are blurred, noisy and compressed. Detections are masks as
-detectors give them: rough, too large, cut, or of something else; some are boxes. Some detections ask for an object that
-is not there ("wrong mesh").
+no colours at all); photographs show the true objects and are blurred, noisy and compressed. Detections have the
+errors of a detector: masks are rough, too large, cut, or of another object, and some are boxes only. Some detections
+are of an object that is not in the image ("wrong mesh").
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ CASES = "cases.json"
 SIZE_HW = (360, 480)
 OTHER_SHAPES = 50_000_000  # first seed of objects of the training generator; training used seeds below 1,000,000
 _FEWEST_PIXELS = 250
-_WRONG_MESH = 0.4  # of the instances get a second detection that asks for an object that is not in the image
+_WRONG_MESH = 0.4  # of the instances get a further detection, of an object that is not in the image
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One detection: what was asked for, and the truth. ``T_cam_obj`` is None where another object's mesh is asked."""
+    """One detection and its ground truth. ``T_cam_obj``: None if the detection is of an absent object."""
 
     im_id: int
     obj_id: int
@@ -91,7 +91,7 @@ def read_cases(root: Path) -> list[Case]:
 
 
 def _true_object(seed: int, k: int) -> Mesh:
-    """Two of three objects come from the generator of training objects, with other seeds, one from the demo's."""
+    """Every third object is from the demo's generator, the others from that of training objects, with other seeds."""
     if k % 3 == 0:
         return make_object(3_000_000 + 1000 * seed + k // 3)
     mesh = make_training_object(OTHER_SHAPES + 1000 * seed + k)
@@ -111,7 +111,7 @@ def _write_models(root: Path, truths: dict[int, Mesh], seed: int) -> None:
 
 
 def imitate_scanned_mesh(mesh: Mesh, rng: Rng) -> Mesh:
-    """The mesh as a scanner or a CAD program gives it: its surface a little off, its colours changed or missing."""
+    """The mesh as from a scanner or CAD program: a slightly wrong surface, and colours changed or missing."""
     size = np.ptp(mesh.vertices, axis=0).max()
     away = mesh.vertices / np.maximum(np.linalg.norm(mesh.vertices, axis=1, keepdims=True), 1e-9)
     off = rng.uniform(0, 0.012) * size * smooth_noise(mesh.vertices / size, rng, scale=rng.uniform(0.05, 0.3))
@@ -128,7 +128,7 @@ def imitate_scanned_mesh(mesh: Mesh, rng: Rng) -> Mesh:
 
 
 def _degrade(rgb: UInt8[np.ndarray, "H W 3"], rng: Rng) -> UInt8[np.ndarray, "H W 3"]:
-    """Exposure, colour cast, blur, noise and compression of a cheap camera."""
+    """Simulate a cheap camera: exposure, colour cast, blur, noise and compression."""
     image = (rgb / 255.0) ** np.exp(rng.uniform(-0.45, 0.45)) * rng.uniform(0.6, 1.15) * rng.uniform(0.85, 1.1, 3)
     sigma = rng.choice([0.0, rng.uniform(0.4, 1.6)])
     image = cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image
@@ -148,7 +148,7 @@ def _pose_record(placed: PlacedObject) -> dict[str, Any]:
 def _detect(
     im_id: int, shown: Sequence[tuple[PlacedObject, Bool[np.ndarray, "H W"]]], absent: Sequence[int], rng: Rng
 ) -> list[tuple[Case, dict[str, Any]]]:
-    """Two detections of each visible instance, and for some a third that asks for an absent object."""
+    """Two detections of each visible instance, and for some a third, of an absent object."""
     found, ranks = list[tuple[Case, dict[str, Any]]](), dict[int, int]()
 
     def add(obj_id: int, T: list[list[float]] | None, visible: float, mask: np.ndarray, iou: float, kind: str) -> None:

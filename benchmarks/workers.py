@@ -1,4 +1,4 @@
-"""``runtime.workers=2`` compared with one process: wall time of a whole run, with the same bytes."""
+"""Compare ``runtime.workers=2`` with one process: wall time of a whole run, and identical bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DATA = ("dataset=demo", "dataset.objects=4", "dataset.images=8", "dataset.per_im
 
 
 def two_workers(*, device: str, repeats: int) -> list[Measurement]:
-    """Wall seconds of onboarding and poses by one process and by two, with one thread each; needs two idle cores."""
+    """Wall seconds of onboarding and poses with one process and with two, one thread each. Needs two idle cores."""
     found = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -24,7 +24,7 @@ def two_workers(*, device: str, repeats: int) -> list[Measurement]:
             found[workers] = run_dzop(folder / str(workers), *chosen, f"runtime.device={device}").wall_s
         one, two = (_stored(folder / str(workers) / "cache") for workers in (1, 2))
     if one != two:
-        raise AssertionError(f"two workers stored other bytes than one: {sorted(one.items() ^ two.items())[:3]}")
+        raise AssertionError(f"two workers stored different bytes than one: {sorted(one.items() ^ two.items())[:3]}")
     return [
         Measurement("4 objects, 600 templates, 32 poses, one process", found[1], "s of wall time"),
         Measurement("4 objects, 600 templates, 32 poses, runtime.workers=2", found[2], "s of wall time"),
@@ -33,7 +33,7 @@ def two_workers(*, device: str, repeats: int) -> list[Measurement]:
 
 
 def _stored(cache: Path) -> dict[str, bytes]:
-    """Checksums of all arrays, by entry; poses are documents, whose measured times differ."""
+    """Checksums of the chunks of each entry. Poses are documents without chunks, because their times differ."""
     store = Store(LocalStoreConfig(root=str(cache)))
     return {
         info.path: repr(sorted((store.attributes(info.path) or {})["complete"].get("chunks", {}).items())).encode()

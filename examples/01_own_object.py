@@ -1,4 +1,4 @@
-"""The pose of one object in one photograph, written to a folder with a page to look at."""
+"""Estimate the pose of one object in one photograph, and write it to a folder with a page to look at."""
 
 import argparse
 

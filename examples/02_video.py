@@ -1,4 +1,4 @@
-"""The pose of one object in every frame of a video: the templates stay in memory, and every frame is one call."""
+"""Estimate the pose of one object in every frame of a video: one estimator keeps the templates, one call per frame."""
 
 import argparse
 import csv
@@ -16,9 +16,9 @@ def main() -> None:
     """Print one line of CSV per frame: its name, the translation in mm, the quaternion and the score."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("mesh", help="the mesh in millimetres")
-    parser.add_argument("frames", type=Path, help="folder of images")
-    parser.add_argument("masks", type=Path, help="folder of masks with the names of the images")
-    parser.add_argument("camera", type=Path, help="camera file of ROS or OpenCV, without distortion")
+    parser.add_argument("frames", type=Path, help="folder of PNG images")
+    parser.add_argument("masks", type=Path, help="folder of masks, named like the images")
+    parser.add_argument("camera", type=Path, help="camera file of ROS or OpenCV; frames must be undistorted")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings as on the command line")
     given = parser.parse_args()
     K = read_camera(given.camera).K

@@ -1,4 +1,4 @@
-"""The poses of several objects in one photograph, in one call."""
+"""Estimate the poses of several objects in one photograph, in one call."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The Python API: meshes once, then poses of images in memory.
+"""The Python API: onboard meshes once, then estimate poses from images in memory.
 
 from pipeline import PoseEstimator
 
@@ -34,16 +34,16 @@ from pipeline.store import MemoryStoreConfig, Store
 
 Mesh = str | PathLike[str]
 SCENE_ID, IM_ID = 0, 0
-MAX_BANKS = 8  # objects whose templates stay in memory
+MAX_BANKS = 8  # most objects whose templates stay in memory
 PLACEHOLDERS = ("dataset=photo", "dataset.mesh=mesh", "dataset.image=image", "dataset.K=[1,1,1,1]")
 
 
 class PoseEstimator:
     """Estimates poses of one or several objects, whose templates are rendered once and cached.
 
-    The templates are those of ``dzop dataset=photo``, in the same cache, and a pose is the same to the last digit.
-    Calls may come from any thread; one is computed at a time. An estimator is a context manager; ``close`` frees its
-    memory. All errors are ``pipeline.errors.DzopError``, with one line that says what was found and what is needed.
+    It shares cached templates with ``dzop dataset=photo`` and returns identical poses. Thread-safe: concurrent calls
+    run one after the other. Also a context manager; ``close`` frees the memory. Invalid input raises
+    ``pipeline.DzopError``, whose message is one line: where the problem is, what was found, what is needed.
     """
 
     def __init__(self, meshes: Mapping[str, Mesh], *, settings: Sequence[str] = (), cache: Mesh | None = None) -> None:
@@ -60,10 +60,10 @@ class PoseEstimator:
     def from_mesh(
         cls, mesh: Mesh | Mapping[str, Mesh], *, settings: Sequence[str] = (), cache: Mesh | None = None
     ) -> PoseEstimator:
-        """An estimator for a mesh file in millimetres, or for several by name; renders templates that are missing.
+        """An estimator for one mesh file in millimetres, or for several by name. Renders templates that are not cached.
 
-        ``settings``: as on the command line, such as ``["method=zs6d", "dataset.scale=1000"]``. ``cache``: folder of
-        the templates, ``cache`` in the current folder by default. Raises DzopError.
+        ``settings``: as on the command line, such as ``["method=zs6d", "dataset.scale=1000"]``. ``cache``: folder
+        that stores the templates; by default ``cache`` in the current folder. Raises DzopError.
         """
         meshes = mesh if isinstance(mesh, Mapping) else {Path(mesh).stem: mesh}
         return cls(meshes, settings=settings, cache=cache)
@@ -80,8 +80,8 @@ class PoseEstimator:
     ) -> PoseResult:
         """The pose of one object in an image.
 
-        ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. ``mask``: h x w, not 0 on
-        the object; or ``bbox``: x, y, width, height. ``name``: the object's, if the estimator has several.
+        ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. Either ``mask``: h x w, 0
+        outside the object, or ``bbox``: x, y, width, height. ``name``: the object, if the estimator has several.
         ``depth_mm``: h x w, registered to the image, 0 where unknown; the pose is fitted to it.
         """
         if (mask is None) == (bbox is None):
@@ -95,9 +95,10 @@ class PoseEstimator:
     def find(
         self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any], *, depth_mm: np.ndarray | None = None
     ) -> tuple[PoseResult, ...]:
-        """The poses of several objects or instances in one image, in the order given.
+        """The poses of several objects or instances in one image, in the order of ``locations``.
 
-        ``locations``: by name, a mask, a box [x, y, width, height], or a list of them for several instances.
+        ``locations``: object name -> mask, box [x, y, width, height], or a list of these for several instances.
+        ``depth_mm``: as in ``__call__``.
         """
         frame = self._frame(parse_image(rgb), K, locations)
         if depth_mm is not None:
@@ -106,7 +107,7 @@ class PoseEstimator:
             return self._estimate(frame, list(locations))
 
     def close(self) -> None:
-        """Free the templates and the model; the cache on disk stays."""
+        """Free the templates and the model. The cache on disk is kept; the estimator cannot be used afterwards."""
         with self._lock:
             self._open.close()
             del self._graph
@@ -122,7 +123,7 @@ class PoseEstimator:
         self.close()
 
     def _onboard(self, paths: Sequence[Path], settings: Sequence[str], cache: Mesh | None) -> Graph:
-        """The graph of the meshes, with all templates made."""
+        """The graph of the meshes, with all templates onboarded."""
         values = compose_settings([*PLACEHOLDERS, *settings])
         if cache is not None:
             values["store"]["root"] = str(cache)

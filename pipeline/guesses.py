@@ -1,4 +1,4 @@
-"""A detection whose mask is a guess: poses with each guess until one convinces, then the best."""
+"""Detections whose mask is a guess: try several masks until a pose is good enough; return the best pose."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from pipeline.route import Route, trace_pose
 
 
 def trace_guesses(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
-    """The trace of the guess whose best pose has most similar cells among its inliers: mean cosine times their number.
+    """The trace of the mask whose best pose scores highest: mean cosine of the features times number of inliers.
 
-    No guess is made after one whose mean cosine is enough (Segmenter.is_enough). The seconds are those of all guesses.
-    Raises NoPose, that of the first, where no guess can be compared with a template.
+    Stops after the first mask whose mean cosine suffices (Segmenter.is_enough). ``times_s`` sums over all masks tried.
+    Raises NoPose with the reason of the first mask if none can be compared with a template.
     """
     if query.others is None:
         return trace_pose(stages, query, bank)
@@ -44,7 +44,7 @@ def trace_guesses(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
 
 
 def _similarity(stages: Stages, guess: Query, bank: TemplateBank, trace: Trace) -> float:
-    """Mean cosine of the best hypothesis; -1 without a pose."""
+    """Mean cosine of the features under the best hypothesis; -1 without a pose."""
     if trace.best.pair is None:
         return -1.0
     route = Route(stages, guess, bank)
@@ -52,7 +52,7 @@ def _similarity(stages: Stages, guess: Query, bank: TemplateBank, trace: Trace) 
 
 
 def _timed(guesses: Iterator[Query], clock: Clock) -> Iterator[Query]:
-    """The guesses, with the seconds of making them."""
+    """Yield the guesses; add the time to make them to ``clock``."""
     while True:
         with clock("guess mask"):
             guess = next(guesses, None)

@@ -46,7 +46,7 @@ def test_good_input_has_nothing_to_do(folder, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     ran = run_dzop(capsys, monkeypatch, "doctor", "mug.ply", "shot.png", "600,600,320,240", "mask.png")
     assert (ran.status, ran.err) == (0, "")
-    assert ran.out.endswith("nothing to do\n")
+    assert ran.out.endswith("no problems found\n")
 
 
 def said(found, text: str):

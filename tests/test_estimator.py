@@ -142,7 +142,7 @@ def test_a_suspicious_mask_is_a_warning(estimator, folder):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"rgb": np.zeros((8, 8, 3))}, "rgb: found float64 of shape (8, 8, 3), needs uint8 of shape (h, w, 3), in rgb"),
+        ({"rgb": np.zeros((8, 8, 3))}, "rgb: found float64 of shape (8, 8, 3), needs uint8 of shape (h, w, 3), in RGB"),
         ({"mask": np.ones((8, 8), bool)}, "mask: found shape (8, 8), needs that of the image, 240 x 320"),
         ({"mask": np.zeros(SIZE_HW, bool)}, "mask: found an empty mask, needs the object's pixels not 0"),
         ({"bbox": [0, 0, 5, 5]}, "mask, bbox: found both, needs one of them"),

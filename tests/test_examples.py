@@ -174,6 +174,6 @@ def test_the_ros_node_publishes_metres_in_the_images_frame(folder, monkeypatch):
     assert transform.transform.translation.z == at.z
     assert detection.bbox.size.x == pytest.approx(np.ptp(make_object(3).vertices[:, 0]) / 1000, rel=1e-5)
     node.on_image(message(rgb, "yuv422"), images[1])
-    assert "yuv422: found an encoding that is not read" in node.log[-1]
+    assert "yuv422: found an unsupported encoding" in node.log[-1]
     assert len((EXAMPLES / "ros2" / "pose_node.py").read_text().splitlines()) <= 150
     node.estimator.close()

@@ -1,8 +1,9 @@
 """A ROS 2 node: image, mask and camera_info -> vision_msgs/Detection3DArray and tf.
 
-Topics: image (sensor_msgs/Image, rgb8 or bgr8), mask (sensor_msgs/Image, mono8, not 0 on the object, with the stamp of
-its image), camera_info (sensor_msgs/CameraInfo of rectified images); detections (vision_msgs/Detection3DArray).
-Parameters: mesh (a file in millimetres), cache (folder of the templates), min_score, settings (as on the command line).
+Topics: image (sensor_msgs/Image, rgb8 or bgr8), mask (sensor_msgs/Image, mono8, 0 outside the object, same stamp as
+the image), camera_info (sensor_msgs/CameraInfo of rectified images); detections (vision_msgs/Detection3DArray).
+Parameters: mesh (a file in millimetres), cache (folder of the templates), min_score (poses with a lower confidence are
+not published), settings (as on the command line).
 """
 
 import message_filters
@@ -40,12 +41,12 @@ class PoseNode(Node):
         return self.get_parameter(name).value
 
     def on_camera_info(self, info: CameraInfo) -> None:
-        """Keep K: that of the rectified image, which P holds; a driver without rectification leaves it 0."""
+        """Keep the K of the rectified image, from P; if the driver does not rectify, P is 0 and K is used."""
         P, K = np.array(info.p).reshape(3, 4)[:, :3], np.array(info.k).reshape(3, 3)
         self.K = P if P[0, 0] > 0 else K
 
     def on_image(self, image: Image, mask: Image) -> None:
-        """Estimate the pose and publish it; an array without detections where there is none."""
+        """Estimate the pose and publish it; without a pose, publish an empty array."""
         if self.K is None:
             self.get_logger().warning("no camera_info yet")
             return
@@ -77,14 +78,14 @@ class PoseNode(Node):
 
 
 def sureness(result: PoseResult) -> float:
-    """The confidence where there is a calibration, otherwise the score."""
+    """The confidence, or the score if there is no calibration."""
     return float(result.score if result.confidence is None else result.confidence)
 
 
 def to_array(message: Image) -> np.ndarray:
     """Pixels of an image message, in the order red, green, blue. Raises ValueError for other encodings."""
     if message.encoding not in CHANNELS:
-        raise ValueError(f"{message.encoding}: found an encoding that is not read, needs one of {', '.join(CHANNELS)}")
+        raise ValueError(f"{message.encoding}: found an unsupported encoding, needs one of {', '.join(CHANNELS)}")
     channels = CHANNELS[message.encoding]
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
     pixels = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
@@ -101,7 +102,7 @@ def set_pose(pose, result: PoseResult, offset_mm=(0.0, 0.0, 0.0)) -> None:
 
 
 def to_transform(result: PoseResult, image: Image) -> TransformStamped:
-    """The pose as a transform from the image's frame to a frame of the object's name."""
+    """The pose as a transform whose parent is the image's frame and whose child frame is named after the object."""
     message = TransformStamped(header=image.header, child_frame_id=result.name)
     at, turn = message.transform.translation, message.transform.rotation
     at.x, at.y, at.z = (result.T_cam_obj[:3, 3] / 1000).tolist()

@@ -28,14 +28,14 @@ _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What is known of a camera. ``size_hw``: of the images that K belongs to, None if that is not stated."""
+    """Parameters of a camera. ``size_hw``: size of the images that K belongs to; None if unknown."""
 
     K: Float[np.ndarray, "3 3"]
     distortion: tuple[float, ...] = ()
     size_hw: tuple[int, int] | None = None
 
     def check_size(self, size_hw: tuple[int, int], where: str) -> None:
-        """Raise BadInput for an image of another size than K belongs to."""
+        """Raise BadInput if K belongs to images of another size."""
         if self.size_hw is not None and self.size_hw != size_hw:
             (h, w), (own_h, own_w) = size_hw, self.size_hw
             found = f"the camera of images of {own_w} x {own_h}"
@@ -70,7 +70,7 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def estimate_camera(path: Path, size_hw: tuple[int, int]) -> CameraFile:
-    """A guess from the focal length that a photograph's EXIF data state for 35 mm film. Raises BadInput without it."""
+    """A camera guessed from the 35 mm equivalent focal length in EXIF. Raises BadInput if it is missing."""
     try:
         with PIL.Image.open(path, formats=IMAGE_FORMATS) as image:
             focal_mm = image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_LENGTH_35MM)
@@ -85,7 +85,7 @@ def estimate_camera(path: Path, size_hw: tuple[int, int]) -> CameraFile:
 
 
 def numbers_in(text: str) -> list[float] | None:
-    """The numbers of a text such as "600 600 320 240" or "[600, 600, 320, 240]"; None if it holds anything else."""
+    """The numbers in a text such as "600 600 320 240" or "[600, 600, 320, 240]"; None if there is other text."""
     words = re.split(r"[\s,;]+", text.strip().strip("[]()").strip())
     try:
         return [float(word) for word in words]
@@ -102,21 +102,21 @@ def _read_mapping(path: Path) -> Mapping[str, Any]:
             record = yaml.load(re.sub(r"\A%YAML[: ][^\n]*\n", "", text), Loader=_Loader)
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         found = " ".join(str(error).split())[:120]
-        raise BadInput(path, found=f"what cannot be read ({found})", needed="a camera file in yaml or json") from None
+        raise BadInput(path, found=f"invalid syntax ({found})", needed="a camera file in yaml or json") from None
     if not isinstance(record, dict):
         raise BadInput(path, found=type(record).__name__, needed="a camera file with named fields")
     return record
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML of plain values and of OpenCV's matrices, which are mappings with rows, cols and data."""
+    """Safe YAML loader that also reads OpenCV's matrices: mappings with rows, cols and data."""
 
 
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))
 
 
 def _numbers(value: Any) -> list[float]:
-    """All numbers of a list, of rows, or of the field ``data``, in order."""
+    """All numbers in a list, in nested rows, or in the field ``data``, in order."""
     if isinstance(value, Mapping):
         return _numbers(value.get("data", []))
     if isinstance(value, Sequence) and not isinstance(value, str):

@@ -131,7 +131,7 @@ class Dataset:
 
     @property
     def image_note(self) -> str:
-        """What was done to the images beyond reading them; pictures say it."""
+        """How images were changed after reading, for the captions of pictures; "" if they were not."""
         return ""
 
     def image_name(self, scene_id: int, im_id: int) -> str:

@@ -1,4 +1,4 @@
-"""An image in memory, its camera, and masks or boxes of objects in it -> a dataset of one image."""
+"""One image in memory, its camera, and masks or boxes of objects -> a dataset of one image."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Location = Bool[np.ndarray, "H W"] | Box
 
 @dataclass(frozen=True, eq=False)
 class Frame(GivenObjects):
-    """A dataset of one image in memory. ``locations``: by obj_id, one mask or box for every instance."""
+    """A dataset of one image in memory. ``locations``: obj_id -> one mask or box per instance."""
 
     rgb: UInt8[np.ndarray, "H W 3"] = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
@@ -38,7 +38,7 @@ class Frame(GivenObjects):
         return self.depth is not None
 
     def depth_mm(self, scene_id: int, im_id: int) -> Float32[np.ndarray, "H W"]:
-        """Measured depth along the optical axis, mm; 0 where unknown. Raises BadInput without one."""
+        """Measured depth along the optical axis, mm; 0 where unknown. Raises BadInput if none was given."""
         if self.depth is None:
             raise BadInput("depth_mm", found="nothing", needed="a depth image, or the setting depth=given")
         return self.depth
@@ -65,15 +65,15 @@ class Frame(GivenObjects):
         return h, w
 
     def image_name(self, scene_id: int, im_id: int) -> str:
-        """There is only one."""
+        """A fixed name: there is only one image."""
         return "image"
 
     def orientation(self, scene_id: int, im_id: int) -> int:
-        """1: an array is as it is."""
+        """1: an array has no EXIF orientation."""
         return 1
 
     def count_frames(self, scene_id: int, im_id: int) -> int:
-        """1: an array is one image."""
+        """1: an array holds one frame."""
         return 1
 
     def K(self, scene_id: int, im_id: int) -> Float[np.ndarray, "3 3"]:
@@ -82,7 +82,7 @@ class Frame(GivenObjects):
 
     @property
     def given_location(self) -> list[Any]:
-        """Digests of the masks and boxes: there are no files whose digests tell them apart."""
+        """Digest of the masks and boxes, in place of the digests of files."""
         masks_and_boxes = [[obj_id, *map(_identify, given)] for obj_id, given in sorted(self.locations.items())]
         return [digest(masks_and_boxes)]
 
@@ -93,15 +93,15 @@ class Frame(GivenObjects):
 
 
 def parse_image(rgb: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
-    """An image as h x w x 3 values of 8 bits; a grey one gets three equal channels. Raises BadInput."""
+    """An image as h x w x 3, uint8; a grey image gets three equal channels. Raises BadInput."""
     image = np.asarray(rgb)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise BadInput("rgb", found=f"{image.dtype} of shape {image.shape}", needed="uint8 of shape (h, w, 3), in rgb")
+        raise BadInput("rgb", found=f"{image.dtype} of shape {image.shape}", needed="uint8 of shape (h, w, 3), in RGB")
     return np.repeat(image[..., None], 3, axis=-1) if image.ndim == 2 else image
 
 
 def parse_depth(depth_mm: np.ndarray, size_hw: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
-    """A depth image in mm, 0 where it is unknown (NaN and infinity as well). Raises BadInput for another shape."""
+    """A depth image in mm; NaN and infinity become 0, unknown. Raises BadInput for another shape or negative values."""
     depth = np.nan_to_num(np.asarray(depth_mm, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     if depth.shape != size_hw:
         needed = f"that of the image, {size_hw[0]} x {size_hw[1]} (rows x columns): register depth to colour first"
@@ -112,9 +112,9 @@ def parse_depth(depth_mm: np.ndarray, size_hw: tuple[int, int]) -> Float32[np.nd
 
 
 def parse_locations(given: Any, size_hw: tuple[int, int]) -> tuple[Location, ...]:
-    """Masks and boxes of the instances of an object, from one mask, one box [x,y,width,height], or a list of them.
+    """Masks and boxes of an object's instances, from one mask, one box [x,y,width,height], or a list of these.
 
-    Raises BadInput for anything else and for what does not fit the image.
+    Raises BadInput for other input, and for a mask or box that does not fit the image.
     """
     if isinstance(given, (list, tuple)) and given and np.ndim(given[0]) > 0:
         return tuple(_parse_location(one, size_hw, f" of instance {n}") for n, one in enumerate(given))

@@ -1,4 +1,4 @@
-"""What a user gives instead of a dataset's folder: meshes, images with cameras, and where objects are."""
+"""User input instead of a dataset folder: meshes, images with cameras, and masks or boxes of the objects."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from pipeline.items.objects import ObjectModel
 from pipeline.items.views import Detection, Target
 
 MIN_DIAMETER_MM = 2.0
-MAX_METRES = 3.0  # a smaller diameter is taken as metres where the unit is to be guessed
+MAX_METRES = 3.0  # units=auto takes a smaller diameter as metres
 Unit = Literal["mm", "cm", "m", "inch", "auto"]
 _FACTORS: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 
 
 @dataclass(frozen=True)
 class MeshFiles:
-    """Meshes of the objects 1, 2, ...; ``scale`` multiplies their vertices, ``simplify`` is the most faces of each.
+    """Meshes of the objects 1, 2, ...; ``scale`` multiplies their vertices, ``simplify`` limits the faces of each.
 
-    ``names``: of the objects; those of the files without them. ``units``: of the files; "auto" takes a mesh as metres
-    if its diameter is below 3, otherwise as millimetres, and says so in its warnings.
+    ``names``: of the objects; by default the names of the files. ``units``: of the files; "auto" takes a mesh as
+    metres, with a warning, if its diameter is below 3, otherwise as millimetres.
     """
 
     paths: tuple[Path, ...] = ()
@@ -43,7 +43,7 @@ class MeshFiles:
     units: Unit = "mm"
 
     def name(self, obj_id: int) -> str:
-        """What a user calls an object."""
+        """The user's name of an object."""
         return self.names[obj_id - 1] if self.names else self.path(obj_id).stem
 
     def path(self, obj_id: int) -> Path:
@@ -78,33 +78,33 @@ class MeshFiles:
 
 @lru_cache(maxsize=64)
 def _diameter_in_file(path: Path, content: str) -> float:
-    """The diameter of a mesh file of this content, in the file's own unit."""
+    """The diameter of a mesh file, in the file's own unit. ``content``: its digest, which keys the memo."""
     return prepare_mesh(path)[1].diameter_mm
 
 
 @dataclass(frozen=True, eq=False)
 class GivenObjects(Dataset):
-    """A dataset without ground truth whose meshes, images and cameras the user gave, and often where objects are."""
+    """A dataset without ground truth, made of the user's meshes, images and cameras, and optionally masks or boxes."""
 
     meshes: MeshFiles = field(default_factory=MeshFiles)
 
     @abstractmethod
     def locate(self, target: Target) -> list[Detection]:
-        """Detections of an object in an image, from the masks or boxes that were given. Raises BadInput without any."""
+        """Detections of an object in an image, from the given masks or boxes. Raises BadInput if there are none."""
 
     @property
     def location_files(self) -> list[Path]:
-        """Files that ``locate`` reads, the photographs among them."""
+        """Files that ``locate`` reads, including the photographs."""
         return []
 
     @property
     def requires_pose(self) -> bool:
-        """True: who gives a photograph wants its pose."""
+        """True: a run that finds no pose is a failure."""
         return True
 
     @property
     def finds_symmetries(self) -> bool:
-        """True: own meshes have no models_info.json."""
+        """True: user meshes have no models_info.json that would list them."""
         return True
 
     def has_ground_truth(self, scene_id: int) -> bool:
@@ -116,7 +116,7 @@ class GivenObjects(Dataset):
         return self.meshes.name(obj_id)
 
     def distortion(self, scene_id: int, im_id: int) -> str:
-        """Nothing: coefficients that are given are applied."""
+        """Empty: images are already undistorted."""
         return ""
 
     def model_path(self, obj_id: int, *, folder: str | None = None) -> Path:
@@ -133,7 +133,7 @@ class GivenObjects(Dataset):
 
 
 def parse_K(K: Sequence[Any], where: str) -> Float[np.ndarray, "3 3"]:
-    """The camera matrix from [fx,fy,cx,cy], the nine numbers of the matrix row by row, or its rows. Raises BadInput."""
+    """The camera matrix from [fx,fy,cx,cy], its nine numbers row by row, or its three rows. Raises BadInput."""
     flat = [value for row in K for value in (row if isinstance(row, (tuple, list)) else (row,))]
     if not all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in flat):
         raise BadInput(where, found=list(K), needed="numbers: [fx,fy,cx,cy] or the matrix, row by row")
@@ -146,7 +146,7 @@ def parse_K(K: Sequence[Any], where: str) -> Float[np.ndarray, "3 3"]:
 
 
 def check_own_camera(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], where: str) -> None:
-    """Raise BadInput for a K that cannot belong to the image: without annotations nothing else can reveal it."""
+    """Raise BadInput for a K that cannot belong to the image: without ground truth, no later check can notice."""
     if pixels := denormalize_camera(K, size_hw):
         fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         fitting = ",".join(f"{v:.6g}" for v in pixels)
@@ -160,7 +160,7 @@ def check_own_camera(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], wher
 
 
 def check_box(bbox_xywh: Sequence[float], size_hw: tuple[int, int], where: str) -> None:
-    """Raise BadInput for a box that is not four finite numbers with an area, or in fractions of the image."""
+    """Raise BadInput unless a box is four finite numbers in pixels, with positive width and height."""
     if len(bbox_xywh) != 4:
         raise BadInput(where, found=f"{len(bbox_xywh)} numbers", needed="4: [x,y,width,height]")
     if not np.isfinite(bbox_xywh).all():
@@ -183,7 +183,7 @@ def check_box_in_image(box: Box, size_hw: tuple[int, int], where: str) -> None:
 
 
 def detect_mask(target: Target, mask: Bool[np.ndarray, "H W"], where: object) -> Detection:
-    """The detection of a mask, with score 1. Raises BadInput for an empty one."""
+    """A detection with this mask and score 1. Raises BadInput if the mask is empty."""
     around = mask_bbox(mask)
     if around is None:
         raise BadInput(where, found="an empty mask", needed="the object's pixels not black")
@@ -191,5 +191,5 @@ def detect_mask(target: Target, mask: Bool[np.ndarray, "H W"], where: object) ->
 
 
 def detect_box(target: Target, box: Box) -> Detection:
-    """The detection of a box (x0, y0, x1, y1), with score 1."""
+    """A detection with this box (x0, y0, x1, y1) and score 1."""
     return Detection(target.scene_id, target.im_id, target.obj_id, 1.0, 0.0, box)

@@ -15,13 +15,13 @@ from pipeline.io.meshes import diameter_mm
 from pipeline.items.objects import Mesh
 
 SYMMETRIES_VERSION = 1
-"""Raise it when the same mesh gives other symmetries."""
+"""Raise it when the symmetries of the same mesh change."""
 _POINTS = 15_000
-_FOOTPRINT = 0.01  # of the diameter: finer patterns of a texture do not tell sides apart
+_FOOTPRINT = 0.01  # of the diameter: finer patterns of a texture are averaged out
 
 
 def mesh_symmetries(mesh: Mesh, diameter: float | None = None) -> tuple[Symmetries, Symmetries]:
-    """Symmetries of a mesh's geometry, and those of them that its colours have as well. ``diameter``: mm, if known."""
+    """Symmetries of a mesh's geometry, and the subset that preserves its colours. ``diameter``: mm, if known."""
     diameter = diameter_mm(mesh) if diameter is None else diameter
     found = spread_points(mesh.vertices, mesh.faces, _POINTS)
     order = np.random.default_rng(0).permutation(_POINTS)

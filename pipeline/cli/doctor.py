@@ -24,14 +24,14 @@ from pipeline.items.objects import Mesh, MeshFacts
 
 Level = Literal["ok", "note", "warning", "error"]
 MANY_FACES, FEW_PIXELS, FAR_ORIGIN = 1_000_000, 1000, 1.5
-NEAR_MM, FAR_MM = 60.0, 10_000.0  # distances at which a camera rarely sees an object that a robot is to take
-FLAT = 1e-3  # smallest side of a bounding box relative to the largest, below which a mesh is a sheet
+NEAR_MM, FAR_MM = 60.0, 10_000.0  # plausible distances of an object that a robot is to pick
+FLAT = 1e-3  # smallest over largest side of the bounding box; below this, a mesh counts as a sheet
 DARK, BRIGHT = 25.0, 235.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One result of a check: what it looked at, what it found, and what to do about it ("" for nothing)."""
+    """The result of a check: its subject, what was found, and the remedy ("" if none is needed)."""
 
     level: Level
     about: str
@@ -44,13 +44,13 @@ class Finding:
 
 
 def doctor_command(arguments: Sequence[str]) -> None:
-    """``dzop doctor MESH [IMAGE K [MASK]]``: print what was found. Exits with status 1 if a run would fail."""
+    """``dzop doctor MESH [IMAGE K [MASK]]``: print the findings. Exits with status 1 if one of them is an error."""
     options = _parser().parse_args(arguments)
     findings = list(examine(options.mesh, options.image, options.K, options.mask, scale=options.scale))
     for finding in findings:
         print(finding.line())
     worst = [finding for finding in findings if finding.level in ("error", "warning")]
-    print(f"\n{len(worst)} of {len(findings)} checks found something" if worst else "\nnothing to do")
+    print(f"\n{len(worst)} of {len(findings)} checks found a problem" if worst else "\nno problems found")
     if any(finding.level == "error" for finding in findings):
         sys.exit(1)
 
@@ -76,13 +76,18 @@ def examine_mesh(mesh: Mesh, facts: MeshFacts, scale: float) -> Iterator[Finding
     yield _examine_unit(d, scale)
     if sides.min() < FLAT * sides.max():
         yield Finding(
-            "warning", "shape", f"flat: {_sides(sides)} mm", "a mesh with a thickness; from behind it is empty"
+            "warning",
+            "shape",
+            f"flat: {_sides(sides)} mm",
+            "use a mesh with thickness; a sheet cannot be seen from behind",
         )
     centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     away = float(np.linalg.norm(centre)) / d
     if away > FAR_ORIGIN:
-        text = f"the origin is {away:.1f} diameters from the middle of the mesh; T_cam_obj states where the origin is"
-        yield Finding("warning", "origin", text, "move the mesh to its origin, or expect large translations")
+        text = f"the origin is {away:.1f} diameters from the middle of the mesh; T_cam_obj places the origin"
+        yield Finding(
+            "warning", "origin", text, "centre the mesh at its origin, or expect translations far from the object"
+        )
     else:
         yield Finding("ok", "origin", f"{away:.1f} diameters from the middle of the mesh")
     if signed_volume(mesh.vertices, mesh.faces) < 0:
@@ -90,7 +95,7 @@ def examine_mesh(mesh: Mesh, facts: MeshFacts, scale: float) -> Iterator[Finding
     for text in facts.warnings:
         yield Finding("warning", "mesh", text)
     if mesh.texture is not None or mesh.colours is not None:
-        kind = "a texture" if mesh.texture is not None else "colours of vertices"
+        kind = "a texture" if mesh.texture is not None else "vertex colours"
         yield Finding("ok", "colours", kind)
     if facts.faces > MANY_FACES:
         yield Finding("warning", "faces", f"{facts.faces / 1e6:.1f} million", "dataset.simplify=200000")
@@ -118,7 +123,7 @@ def _examine_photograph(
         size_hw = image_size(Path(image).expanduser())
         yield from _examine_pixels(Path(image).expanduser(), size_hw)
         if K is None:
-            yield Finding("error", "K", "not given", "K in pixels as fx,fy,cx,cy, a camera file, or exif")
+            yield Finding("error", "K", "not given", "give K in pixels as fx,fy,cx,cy, a camera file, or exif")
             return
         photo = PhotoConfig(mesh=mesh, image=image, K=K, mask=mask).open()
         problem = diagnose_camera(photo.camera_matrix, size_hw, exif_orientation=photo.orientation(0, 0))
@@ -137,14 +142,16 @@ def _examine_pixels(path: Path, size_hw: tuple[int, int]) -> Iterator[Finding]:
     (h, w), mean = size_hw, float(grey.mean())
     if mean < DARK or mean > BRIGHT:
         how = "dark" if mean < DARK else "bright"
-        yield Finding("warning", "image", f"very {how}: a mean of {mean:.0f} of 255", "another exposure")
+        yield Finding("warning", "image", f"very {how}: a mean of {mean:.0f} of 255", "change the exposure")
     yield Finding("ok", "image", f"{w} x {h} pixels (width x height)")
     if read_orientation(path) != 1:
-        yield Finding("note", "image", "is turned upright by its EXIF orientation", "K and mask of the upright image")
+        yield Finding(
+            "note", "image", "is turned upright by its EXIF orientation", "give K and mask of the upright image"
+        )
 
 
 def _examine_mask(photo: Photo, size_hw: tuple[int, int], diameter_mm: float | None) -> Iterator[Finding]:
-    """Area, pieces and border of the mask, and the distance that its size and the mesh's give."""
+    """Area, pieces and border of the mask, and the distance that follows from its size and the mesh's."""
     path = photo.masks[0][0]
     mask = photo.object_mask(path, size_hw)
     pixels, share = int(mask.sum()), float(mask.mean())
@@ -155,19 +162,19 @@ def _examine_mask(photo: Photo, size_hw: tuple[int, int], diameter_mm: float | N
     if share > 0.98 or (all(sides) and share > 0.5):
         yield Finding("warning", "mask", f"covers {share:.0%} of the image and touches all sides", "invert the mask")
     elif pixels < FEW_PIXELS:
-        yield Finding("warning", "mask", f"only {pixels} pixels", "a closer photograph or a higher resolution")
+        yield Finding("warning", "mask", f"only {pixels} pixels", "use a closer photograph or a higher resolution")
     else:
         yield Finding("ok", "mask", f"{pixels} pixels, {share:.1%} of the image")
     if any(sides) and not all(sides):
-        yield Finding("note", "mask", "touches the border: a part of the object may lie outside the image")
+        yield Finding("note", "mask", "touches the border: part of the object may lie outside the image")
     if (pieces := _count_pieces(mask)) > 1:
-        yield Finding("note", "mask", f"{pieces} separate pieces: one object behind something, or several objects")
+        yield Finding("note", "mask", f"{pieces} separate pieces: a partly hidden object, or several objects")
     if diameter_mm is not None:
         yield _examine_distance(photo, mask, diameter_mm)
 
 
 def _examine_distance(photo: Photo, mask: Bool[np.ndarray, "H W"], diameter_mm: float) -> Finding:
-    """The distance at which an object of this diameter is as large as the mask; an occluded one is nearer."""
+    """The distance at which an object of this diameter appears as large as the mask; if occluded, it is nearer."""
     rows, columns = np.nonzero(mask)
     longest_px = float(np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1))
     distance_mm = float(photo.camera_matrix[0, 0]) * diameter_mm / longest_px
@@ -181,7 +188,7 @@ def _examine_distance(photo: Photo, mask: Bool[np.ndarray, "H W"], diameter_mm: 
 
 
 def _count_pieces(mask: Bool[np.ndarray, "H W"]) -> int:
-    """Connected parts of a mask that have at least a hundredth of its pixels."""
+    """Number of connected parts with at least 1 % of the mask's pixels."""
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     return int((stats[1:, cv2.CC_STAT_AREA] >= mask.sum() / 100).sum())
 

@@ -41,7 +41,7 @@ def _object_id(path: Path, number: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dzop symmetry",
-        description="Find the symmetries of meshes, those of the shape and those that the colours have as well.",
+        description="Find the symmetries of meshes: those of the shape, and those that also preserve the colours.",
     )
     add = parser.add_argument
     add("meshes", nargs="+", help="mesh files in millimetres")

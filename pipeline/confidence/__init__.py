@@ -1,1 +1,1 @@
-"""How far a pose can be trusted: its evidence, and the probability that it is right."""
+"""The probability that a pose is right, and the evidence that it is computed from."""

@@ -1,7 +1,7 @@
-"""evidence -> the probability that a pose is right: a logistic model whose coefficients are a JSON file.
+"""evidence -> the probability that a pose is right: a logistic regression, with its coefficients in a JSON file.
 
-``python -m benchmarks.confidence`` fits it on procedural data and writes the file. A calibration belongs to one method:
-with other variants of the stages or other features, evidence means something else, and the confidence is unknown.
+``python -m benchmarks.confidence`` fits it on procedural data and writes the file. A calibration is valid for one
+method: with other variants of the stages or other features, the same evidence implies another probability.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipeline.spec import digest
 
 SHIPPED = Path(__file__).with_name("calibrations")
 CALIBRATED_STAGES = ("extract", "crop", "match", "fuse", "cluster", "correspond", "solve", "choose", "refine")
-"""The stages whose variants a calibration belongs to."""
+"""A calibration is valid for one variant of each of these stages."""
 
 _TRANSFORMS: Mapping[str, Callable[[float], float]] = {
     "linear": float,
@@ -34,9 +34,9 @@ _TRANSFORMS: Mapping[str, Callable[[float], float]] = {
 
 @dataclass(frozen=True)
 class Term:
-    """A summand of the model: (transform(evidence[name]) - mean) / scale, times a weight for each threshold.
+    """One term of the regression: (transform(evidence[name]) - mean) / scale, times a weight per error threshold.
 
-    Missing evidence counts as its mean.
+    Missing evidence counts as the mean.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Term:
     weight_10: float
 
     def value(self, evidence: Mapping[str, float]) -> float:
-        """The standardised value; 0 where it is missing."""
+        """The standardised value; 0, the mean, if it is missing."""
         if self.name not in evidence:
             return 0.0
         return (_TRANSFORMS[self.transform](evidence[self.name]) - self.mean) / self.scale
@@ -55,12 +55,12 @@ class Term:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A fitted model. ``kinds`` and ``recipes``: of the stages that it was fitted with, recipes as digests.
+    """A fitted model. ``kinds`` and ``recipes`` (digests): of the stages that it was fitted with.
 
-    ``bias_20``, ``bias_10``: intercepts for the thresholds of 20 % and 10 % of the diameter. A pose is accepted from a
-    confidence of ``accept`` on and rejected below ``reject``. ``rival_power`` and ``rival_share``: how the probability
-    that the pose is wrong is shared among its alternatives. ``command`` made the file; ``measured`` says how well it
-    does.
+    ``bias_20``, ``bias_10``: intercepts for the thresholds of 20 % and 10 % of the diameter. A pose is accepted at a
+    confidence of at least ``accept`` and rejected below ``reject``. ``rival_share``: probability that a wrong pose has
+    the right one among its alternatives; they share it in proportion to ``support ** rival_power``. ``command``: wrote
+    the file. ``measured``: quality on test scenes.
     """
 
     kinds: Mapping[str, str]
@@ -77,14 +77,14 @@ class Calibration:
 
     @property
     def digest(self) -> str:
-        """Digest of all that changes a confidence."""
+        """Digest of everything that affects a confidence."""
         content = {name: value for name, value in asdict(self).items() if name not in ("command", "measured")}
         return digest(content | {"terms": [asdict(term) for term in self.terms]})
 
     def apply(self, estimate: PoseEstimate) -> PoseEstimate:
-        """The estimate with confidence, decision, the weights of its alternatives, and its confidence as score.
+        """The estimate with confidence, decision, the weights of its alternatives, and the confidence as score.
 
-        A fallback has no evidence: its confidence stays unknown, and it is rejected.
+        A fallback has no evidence: it gets no confidence and score 0, and is rejected.
         """
         if not estimate.evidence:
             return replace(estimate, score=0.0, decision="reject")
@@ -108,7 +108,7 @@ class Calibration:
         return "check" if confidence >= self.reject else "reject"
 
     def _weigh(self, estimate: PoseEstimate, confidence: float) -> tuple[Any, ...]:
-        """The alternatives with their probabilities: a share of what the estimate's own leaves, by their support."""
+        """The alternatives with their probabilities: they divide a share of 1 - confidence by their support."""
         powers = [alternative.support**self.rival_power for alternative in estimate.alternatives]
         total = max(sum(powers), 1e-12)
         left = (1 - confidence) * self.rival_share
@@ -119,7 +119,7 @@ class Calibration:
 
 
 def choose_calibration(stages: Stages, choice: str) -> Calibration | None:
-    """The calibration of a method. ``choice``: "auto" (a shipped one, None without one), "none", or a JSON file.
+    """The calibration of a method. ``choice``: "auto" (one that ships, or None if none fits), "none", or a JSON file.
 
     Raises BadInput for a file that was fitted with other variants of stages.
     """
@@ -137,29 +137,29 @@ def choose_calibration(stages: Stages, choice: str) -> Calibration | None:
 
 
 def identify_variants(stages: Stages) -> dict[str, str]:
-    """Kind of every stage that a calibration belongs to. Reads no weights."""
+    """The kind of each stage that a calibration depends on. Reads no weights."""
     kinds = {name: getattr(stages, name).kind for name in CALIBRATED_STAGES}
     return kinds | {"second look": "drawn" if stages.second_look.hypotheses else "none"}
 
 
 def identify_settings(stages: Stages) -> dict[str, str]:
-    """Digest of the recipe of every stage that a calibration belongs to. Raises NotDownloaded."""
+    """Digest of the recipe of each stage that a calibration depends on. Raises NotDownloaded."""
     recipes = {name: digest(getattr(stages, name).recipe()) for name in CALIBRATED_STAGES}
     return recipes | {"second look": digest(stages.second_look.recipe())}
 
 
 def describe_confidence(stages: Stages, calibration: Calibration | None, choice: str) -> str:
-    """A warning where poses have no confidence, or one that was fitted with other settings; "" otherwise."""
+    """A warning if poses get no confidence, or one that was fitted with other settings; otherwise ""."""
     if choice == "none":
         return ""
     refit = "python -m benchmarks.confidence fits one"
     if calibration is None:
-        return f"poses have no confidence: none was fitted for this method and these features; {refit}"
+        return f"poses have no confidence: no calibration was fitted for this method and these features; {refit}"
     recipes = identify_settings(stages)
     other = [name for name, recipe in recipes.items() if calibration.recipes.get(name) != recipe]
     if not other:
         return ""
-    return f"confidence was fitted with other settings of {', '.join(other)}; {refit}"
+    return f"the confidence was fitted with other settings of {', '.join(other)}; {refit}"
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What speaks for and against a detection's pose, without ground truth: from this, confidence is estimated."""
+"""trace -> evidence for and against a pose, computed without ground truth: the input of its confidence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.items.poses import Alternative
 from pipeline.metrics.pose_error import hull_vertices, mssd
 
 NEAR = 0.2
-"""Poses whose MSSD is below this share of the diameter count as the same."""
+"""Poses whose MSSD is below this share of the diameter count as the same pose."""
 MOST_ALTERNATIVES = 4
 _LEAST_SUPPORT = 0.3
 _EXTENT_POINTS = 48
@@ -25,19 +25,19 @@ _EXTENT_POINTS = 48
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """What the distance between two poses of an object is measured on: outermost points (mm) and symmetries."""
+    """The outermost points (mm) and symmetries of an object, for measuring the distance between two poses."""
 
     points: Float[np.ndarray, "p 3"]
     symmetries: Float[np.ndarray, "s 4 4"]
     diameter_mm: float
 
     def distance(self, T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"]) -> float:
-        """MSSD of two poses over the diameter: symmetric copies have distance 0."""
+        """MSSD of two poses, divided by the diameter; symmetric copies have distance 0."""
         return mssd(T_a, T_b, self.points, self.symmetries) / self.diameter_mm
 
 
 def measure_extent(model: ObjectModel) -> Extent:
-    """The extent of an object: 48 vertices of its convex hull, each the farthest from those before."""
+    """The extent of an object: 48 vertices of its convex hull, by farthest point sampling."""
     hull = hull_vertices(model.mesh.vertices)
     chosen = [int(np.argmax(np.linalg.norm(hull - hull.mean(axis=0), axis=1)))]
     nearest = np.full(len(hull), np.inf)
@@ -50,9 +50,9 @@ def measure_extent(model: ObjectModel) -> Extent:
 def collect_evidence(
     trace: Trace, query: Query, geometry: PairGeometry, extent: Extent
 ) -> tuple[dict[str, float], tuple[Alternative, ...]]:
-    """Evidence of the trace's best pose by name, and the other poses that were found, best first.
+    """Evidence for the trace's best pose, by name, and the alternatives, best first.
 
-    ``geometry``: of the best hypothesis. What a method does not compute is missing from the evidence.
+    ``geometry``: of the best hypothesis. Quantities that a method does not compute are missing.
     """
     others, rivals = _compare_hypotheses(trace, extent)
     found = _count_matches(trace.best, query)
@@ -69,7 +69,7 @@ def collect_evidence(
 
 
 def _compare_hypotheses(trace: Trace, extent: Extent) -> tuple[list[bool], list[Alternative]]:
-    """Whether each other hypothesis disagrees with the best, and those that do, without near repetitions."""
+    """For each other hypothesis, whether it disagrees with the best; and those that do, without near duplicates."""
     best, disagrees, rivals = trace.best, list[bool](), list[Alternative]()
     for other in trace.hypotheses[1:]:
         if other.solution is None or best.solution is None:
@@ -89,7 +89,7 @@ def _compare_hypotheses(trace: Trace, extent: Extent) -> tuple[list[bool], list[
 
 
 def _relative_score(other: Hypothesis, best: Hypothesis) -> float:
-    """Score of a hypothesis relative to the best one's, both from the same look."""
+    """Score of a hypothesis relative to the best one's, both from before or both from after the rerender."""
     ours, reference = other, best
     if other.rerendered is None and best.first is not None:
         reference = best.first
@@ -116,7 +116,7 @@ def _count_matches(best: Hypothesis, query: Query) -> dict[str, float]:
 
 
 def _compare_features(best: Hypothesis, geometry: PairGeometry) -> dict[str, float]:
-    """How well the features agree in the final pose: mean cosine, and the share of the query that is covered."""
+    """Agreement of the features in the final pose: mean cosine, and the share of the query that is covered."""
     if best.solution is None:
         return {}
     pair = geometry.pair
@@ -128,7 +128,7 @@ def _compare_features(best: Hypothesis, geometry: PairGeometry) -> dict[str, flo
 
 
 def _compare_silhouettes(best: Hypothesis, query: Query, extent: Extent) -> dict[str, float]:
-    """How the silhouette of the rerendered view fits the query's mask, and how far its own solution moved from it."""
+    """Fit of the rerendered silhouette to the query's mask, and how far the pose moved after the rerender."""
     view, first = best.rerendered, best.first
     if view is None or first is None or first.solution is None or best.solution is None:
         return {}

@@ -1,4 +1,4 @@
-"""pose, measured depth -> the pose moved along the viewing ray and aligned with the measured surface."""
+"""pose, measured depth -> the pose, moved along the viewing ray and aligned with the measured surface."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pipeline.functional.rigid import inverse, rigid, transform
 
 FEWEST_POINTS = 60
 MOST_TRAVEL = 0.15
-"""Of the diameter: an alignment that moves a point further has slid along something else."""
+"""Of the diameter: an alignment that moves a point this far has latched onto another surface, and is discarded."""
 _POINTS = 2000
-_MOST_SLOPED = 0.3  # cosine between a normal and the viewing ray; depth is unreliable on surfaces seen at a smaller one
+_MOST_SLOPED = 0.3  # least cosine between normal and viewing ray; depth is unreliable at grazing angles
 
 Pose = Float[np.ndarray, "4 4"]
 DepthImage = Float[np.ndarray, "H W"]
@@ -24,7 +24,7 @@ DepthImage = Float[np.ndarray, "H W"]
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurface:
-    """Points and normals of a depth image in the camera frame, mm; ``valid``: pixels in the mask that have both."""
+    """Points and normals of a depth image in the camera frame, mm; ``valid``: pixels of the mask with both."""
 
     points: Float[np.ndarray, "H W 3"]
     normals: Float[np.ndarray, "H W 3"]
@@ -41,10 +41,10 @@ def fit_depth(
     *,
     rounds: int,
 ) -> Pose:
-    """The pose fitted to measured depth (mm, 0 where unknown) inside ``mask``; unchanged where too little is measured.
+    """The pose fitted to measured depth (mm, 0 where unknown) inside ``mask``; unchanged if too little is measured.
 
-    First the translation follows the viewing ray by the median difference to the rendered depth, then ``rounds`` of
-    iterated closest points align the visible surface with the measured one, point to plane (Chen and Medioni, 1992).
+    First moves the pose along the viewing ray by the median difference between measured and rendered depth. Then
+    ``rounds`` of point-to-plane ICP (Chen and Medioni, 1992) align the visible surface with the measured one.
     """
     moved = _follow_ray(T_cam_obj, render, depth_mm, mask, K)
     drawn = render(moved)
@@ -94,7 +94,7 @@ def _backproject(depth_mm: DepthImage, K: Float[np.ndarray, "3 3"]) -> Float[np.
 def _measure_surface(
     depth_mm: DepthImage, mask: Bool[np.ndarray, "H W"], K: Float[np.ndarray, "3 3"]
 ) -> MeasuredSurface:
-    """Normals come from differences of the smoothed depth over two pixels."""
+    """Points and normals of the measured depth; normals are finite differences of the smoothed depth."""
     points = _backproject(depth_mm, K)
     smooth = _backproject(cv2.bilateralFilter(depth_mm.astype(np.float32), 7, 15.0, 3.0), K)
     across = np.roll(smooth, -2, axis=1) - np.roll(smooth, 2, axis=1)
@@ -114,9 +114,9 @@ def _align_once(
     K: Float[np.ndarray, "3 3"],
     gate: float,
 ) -> tuple[Pose, float] | None:
-    """One step point to plane, each point paired with the measured one at its pixel; and the spread of residuals (mm).
+    """The pose after one point-to-plane step, and the spread of the residuals, mm.
 
-    None where too few points have a partner within ``gate``.
+    Each point is paired with the measured point at its pixel. None if too few pairs are within ``gate`` (mm).
     """
     points = transform(T_cam_obj, points_obj)
     px = points @ K.T
@@ -135,7 +135,7 @@ def _align_once(
     centre = points.mean(axis=0)
     jacobian = np.concatenate([np.cross(points - centre, normals), normals], axis=1)
     normal_matrix = jacobian.T @ (weight[:, None] * jacobian)
-    # a little damping keeps motions that the surface does not determine, such as turns of a can, at zero
+    # light damping keeps unconstrained motions, such as a can's rotation about its axis, at zero
     damping = 1e-3 * np.diag(np.diag(normal_matrix)) + 1e-9 * np.eye(6)
     step = np.linalg.solve(normal_matrix + damping, jacobian.T @ (weight * residual))
     R = Rotation.from_rotvec(step[:3]).as_matrix()

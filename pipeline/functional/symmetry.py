@@ -14,12 +14,12 @@ from pipeline.functional.rigid import inverse, nearest_rotation, rigid, rotation
 
 FOLDS = (2, 3, 4, 5, 6, 8)
 GENERIC_DEG = (14.0, 41.0, 77.0, 112.0, 163.0)
-"""Angles that no common n-fold symmetry has: an axis that all of them fit is one of a continuous symmetry."""
+"""Angles of no common n-fold symmetry: if all of them fit about an axis, its symmetry is continuous."""
 MEAN_OFF = 0.0065
 MOST_OFF = 0.040
-"""Of the diameter: largest mean distance, and distance of 98 % of the surface, from its copy."""
+"""Largest distance between a surface and its copy, over the diameter: the mean, and the 98 % quantile."""
 COLOUR_OFF = 0.10
-"""Of the range of values: largest mean difference of colours between a surface and its copy."""
+"""Largest mean difference of colours between a surface and its copy, over the range of values."""
 _COARSE_OFF = 0.02
 _FEW, _MANY = 300, 2000
 _AXES = 400
@@ -32,9 +32,9 @@ _ROUNDS = 8
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points spread evenly over a surface, mm, with their colours (0 to 1; None: without) and its diameter.
+    """Points spread evenly over a surface, mm, their colours (0 to 1, or None) and the surface's diameter.
 
-    They are in random order, so the first ones are spread evenly, too.
+    The points are in random order, so the first n are spread evenly, too.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -52,7 +52,7 @@ class Symmetries:
 
     @property
     def text(self) -> str:
-        """In words, such as "any angle about (0 0 1), 180 degrees about (1 0 0)"."""
+        """The symmetries in words, such as "any angle about (0 0 1), 180 degrees about (1 0 0)"."""
         parts = [f"any angle about {_axis_text(axis)}" for axis in self.axes]
         if len(self.discrete) > 3:
             parts.append(f"{len(self.discrete)} rotations")
@@ -71,7 +71,7 @@ NO_SYMMETRIES = Symmetries(np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros((0, 3
 
 
 class _Comparison:
-    """How far copies of a surface are from it."""
+    """Compares a surface with rotated copies of itself."""
 
     def __init__(self, surface: Surface) -> None:
         self.surface = surface
@@ -86,12 +86,12 @@ class _Comparison:
         return rigid(R, self.centre - R @ self.centre)
 
     def mean_off(self, T: Float[np.ndarray, "4 4"]) -> float:
-        """Mean distance of a few copied points from the surface, over the diameter."""
+        """Mean distance of a few moved points from the surface, over the diameter."""
         distance = self.tree.query(transform(T, self.few))[0]
         return float(np.maximum(distance - self.floor, 0).mean() / self.surface.diameter)
 
     def refine(self, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """The transform nearby that brings the copy closest, by iterated closest points."""
+        """The transform refined by ICP, so that the copy fits the surface best."""
         for _ in range(_ROUNDS):
             moved = transform(T, self.few)
             distance, index = self.tree.query(moved)
@@ -103,13 +103,13 @@ class _Comparison:
         return T
 
     def fits(self, T: Float[np.ndarray, "4 4"]) -> bool:
-        """Whether the copy is the surface, but for small features."""
+        """Whether the copy coincides with the surface, apart from small features."""
         distance = np.concatenate([self.tree.query(transform(M, self.many))[0] for M in (T, inverse(T))])
         distance = np.maximum(distance - self.floor, 0) / self.surface.diameter
         return bool(distance.mean() < MEAN_OFF and np.quantile(distance, 0.98) < MOST_OFF)
 
     def looks_the_same(self, T: Float[np.ndarray, "4 4"]) -> bool:
-        """Whether the copy has the surface's colours, too."""
+        """Whether the copy has the same colours as the surface."""
         colours = self.surface.colours
         if colours is None:
             return True
@@ -123,10 +123,10 @@ class _Comparison:
 
 
 def find_symmetries(surface: Surface) -> tuple[Symmetries, Symmetries]:
-    """Symmetries of the geometry, and those of them that the colours have as well.
+    """Symmetries of the geometry, and the subset that preserves the colours.
 
-    Candidates are rotations about axes through the centre that leave the moments of inertia as they are; they are
-    refined by iterated closest points. A feature below 2 % of the surface does not count.
+    Candidates are rotations, about axes through the centre, that preserve the moments of inertia; ICP refines them.
+    Features on less than 2 % of the surface are ignored.
     """
     compared = _Comparison(surface)
     continuous = _find_continuous(compared)
@@ -143,7 +143,7 @@ def find_symmetries(surface: Surface) -> tuple[Symmetries, Symmetries]:
 
 
 def _candidate_axes(compared: _Comparison) -> list[Float[np.ndarray, " 3"]]:
-    """The principal axes of inertia, and directions all over where two moments are nearly equal."""
+    """The principal axes of inertia; where moments are nearly equal, also directions all over their plane or sphere."""
     centred = compared.surface.points - compared.centre
     moments, principal = np.linalg.eigh(centred.T @ centred / len(centred))
     axes = list(principal.T)
@@ -162,7 +162,7 @@ def _candidate_axes(compared: _Comparison) -> list[Float[np.ndarray, " 3"]]:
 
 
 def _find_continuous(compared: _Comparison) -> list[Float[np.ndarray, " 3"]]:
-    """Axes of continuous symmetries: none, one, or three orthogonal ones for a ball."""
+    """Axes of continuous symmetry: none, one, or three orthogonal ones for a ball."""
     found: list[Float[np.ndarray, " 3"]] = []
     for axis in _candidate_axes(compared):
         if any(abs(axis @ other) > np.cos(np.radians(_SAME_DEG)) for other in found):
@@ -179,7 +179,7 @@ def _find_continuous(compared: _Comparison) -> list[Float[np.ndarray, " 3"]]:
 
 
 def _find_discrete(compared: _Comparison, continuous: Sequence[np.ndarray]) -> list[Float[np.ndarray, "4 4"]]:
-    """Discrete symmetries that the continuous ones do not contain, closed under composition."""
+    """Discrete symmetries that do not follow from the continuous ones, closed under composition."""
     if len(continuous) > 1:
         return []
     found: list[Float[np.ndarray, "4 4"]] = []
@@ -205,7 +205,7 @@ def _find_discrete(compared: _Comparison, continuous: Sequence[np.ndarray]) -> l
 def _is_known(
     T: Float[np.ndarray, "4 4"], known: Sequence[Float[np.ndarray, "4 4"]], *, within_deg: float = _SAME_DEG
 ) -> bool:
-    """Whether a transform is the identity or one of those known, within a few degrees."""
+    """Whether a rotation is within an angle of the identity or of a known one."""
     others = np.stack([np.eye(4), *known])[:, :3, :3]
     return bool((rotation_angle_deg(others, np.broadcast_to(T[:3, :3], others.shape)) < within_deg).any())
 
@@ -215,7 +215,7 @@ def _close(
     refine: Callable[[Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]],
     fits: Callable[[Float[np.ndarray, "4 4"]], bool],
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """The transforms with their products, as far as those fit, too."""
+    """The transforms and all products of them that also fit, at most ``_MOST``."""
     group: list[Float[np.ndarray, "4 4"]] = []
     for T in found:
         if not _is_known(T, group):
@@ -245,7 +245,7 @@ def _as_symmetries(
 def make_canonical(
     T_cam_obj: Float[np.ndarray, "4 4"], symmetries: Float[np.ndarray, "s 4 4"]
 ) -> Float[np.ndarray, "4 4"]:
-    """The symmetric copy of a pose whose rotation is nearest the identity: one pose for one picture."""
+    """The symmetric copy whose rotation is nearest the identity, so that one image gives one pose."""
     copies = T_cam_obj @ symmetries
     turned = np.trace(copies[:, :3, :3], axis1=1, axis2=2)
     return np.asarray(copies[int(turned.argmax())])

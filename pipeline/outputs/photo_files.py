@@ -1,4 +1,4 @@
-"""Results of one photograph -> pose.json, overlay.jpg and pose.html in a folder that a person finds."""
+"""Results of one photograph -> pose.json, overlay.jpg and pose.html in a folder."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ def save_results(
 ) -> list[Path]:
     """Write results of one image to a folder: pose.json, and with ``overlay`` overlay.jpg and pose.html.
 
-    ``image``: the photograph's file. ``more``: further fields of pose.json. ``cards``: draws how each pose was found,
-    for the page. ``note``: what was done to the photograph. Returns the files. Raises DzopError.
+    ``image``: the photograph's file. ``more``: further fields of pose.json. ``cards``: draws the figures of
+    how each pose was found, for the page. ``note``: how the photograph was changed. Returns the files. Raises
+    DzopError.
     """
     to = Path(folder)
     files = [_write_json(to, results, image=image, more=more or {})]
@@ -53,7 +54,7 @@ def save_results(
 
 
 def link_latest(folder: Path) -> None:
-    """Let ``latest`` beside the folder point to it, where the file system has symbolic links."""
+    """Link ``latest``, beside the folder, to it, if the file system supports symbolic links."""
     link = folder.parent / LATEST
     new = folder.parent / f".{LATEST}.{os.getpid()}.partial"
     if link.exists() and not link.is_symlink():

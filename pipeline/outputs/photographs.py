@@ -1,4 +1,4 @@
-"""Answers of a run on given photographs -> a folder for each photograph, and lines for the terminal."""
+"""Answers of a run on the user's photographs -> one folder per photograph, and lines for the terminal."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pipeline.outputs.pictures import Pictures
 from pipeline.outputs.pose_result import PoseResult, result_of
 
 FILES_VERSION = 2
-"""Raise it when the files of the same results look different."""
-RESERVED = (LATEST, "report", "multirun", "records")  # other things in the folder of results
+"""Raise it when the files written for the same results change."""
+RESERVED = (LATEST, "report", "multirun", "records")  # names of other files and folders in the folder of results
 
 
 @dataclass(eq=False)
@@ -48,7 +48,7 @@ class Photographs:
         ]
 
     def write(self, *, overlays: bool, cards: bool) -> list[Path]:
-        """Write the folder of every photograph, unless it holds these results already; returns the folders."""
+        """Write the folder of every photograph unless it already holds these results; returns the folders."""
         by_image: defaultdict[ImageId, list[int]] = defaultdict(list)
         for index, answer in enumerate(self.answers):
             by_image[answer.scene_id, answer.im_id].append(index)
@@ -84,11 +84,11 @@ class Photographs:
         return "\n".join(lines)
 
     def _with_model(self, index: int) -> PoseResult:
-        """A result that can be drawn. The mesh is read only for that: a cached run draws nothing."""
+        """A result that can be drawn. Reads the mesh, which a cached run does not need."""
         return replace(self.results[index], model=self.folder.context.model(self.answers[index].obj_id))
 
     def _folder_name(self, image: ImageId) -> str:
-        """The photograph's name without its suffix; with a number where another one has the same."""
+        """The photograph's name without suffix; a number is added if another photograph has the same name."""
         data = self.folder.context.dataset
         names = {other: Path(data.image_name(*other)).stem.lstrip(".") for other in self.folder.context.image_ids}
         name = names[image] or "photograph"

@@ -1,4 +1,4 @@
-"""An answer of the route -> the result that a user gets: a pose with what is known of it, or a reason."""
+"""An answer of the route -> the result for the user: a pose with its quality measures, or why there is none."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class PoseResult:
     """The pose of one object in one image, or the reason why there is none.
 
     ``T_cam_obj``: 4 x 4, object to camera coordinates, mm; camera axes x right, y down, z forward (OpenCV). None
-    without a pose; ``stage`` and ``reason`` then say what failed. ``score`` ranks estimates. ``confidence``: the
-    probability that the pose is right, and ``decision`` what to do with it (accept, check or reject); None where no
-    calibration exists. ``alternatives``: other poses that were found, best first. ``warnings``: what is suspicious
-    about mesh, camera, mask or box. ``correspondences``: point matches, of which ``inliers`` agree with the pose.
+    if no pose was found; ``stage`` and ``reason`` then say what failed. ``score`` ranks estimates. ``confidence``: the
+    probability that the pose is right, and ``decision`` what to do with it (accept, check or reject); None without a
+    calibration. ``alternatives``: other poses that were found, best first. ``warnings``: possible problems with the
+    mesh, camera, mask or box. ``correspondences``: point matches, of which ``inliers`` agree with the pose.
     ``times_s``: seconds by stage. ``mesh``: the mesh's file.
     """
 
@@ -64,14 +64,14 @@ class PoseResult:
         return None if self.T_cam_obj is None else float(np.linalg.norm(self.T_cam_obj[:3, 3]))
 
     def overlay(self) -> UInt8[np.ndarray, "H W 3"]:
-        """The image with the outline, the 3D box and the axes (x red, y green, z blue) of the pose.
+        """The image with the object's outline, 3D box and axes (x red, y green, z blue), drawn in its pose.
 
         An image smaller than 1000 px is enlarged by an integer factor.
         """
         return draw_results([self])
 
     def to_record(self) -> dict[str, Any]:
-        """The result as a pose of pose.json (docs/python.md has its fields)."""
+        """The result as an entry of ``poses`` in pose.json; docs/python.md explains the fields."""
         T, quaternion = self.T_cam_obj, self.quaternion_xyzw
         return {
             "name": self.name,
@@ -100,7 +100,7 @@ class PoseResult:
         return f"{error}; {sum(self.times_s.values()):.1f} s"
 
     def summary(self) -> str:
-        """One line: the name, and how sure and how far the pose is, or the reason why there is none."""
+        """One line: the name, then confidence and position of the pose, or the reason why there is none."""
         if self.T_cam_obj is None:
             return f"{self.name}: no pose: {self.stage}: {self.reason}"
         x, y, z = self.T_cam_obj[:3, 3]
@@ -119,7 +119,7 @@ def result_of(
     model: ObjectModel | None = None,
     warnings: Sequence[str] = (),
 ) -> PoseResult:
-    """The result of an answer; it can be drawn with the object's model."""
+    """The result of an answer. Only with ``model`` can it be drawn."""
     if isinstance(answer, NoEstimate):
         stage, reason = answer.stage, answer.reason
         about = tuple(warnings)
@@ -143,7 +143,7 @@ def result_of(
 
 
 def draw_results(results: Sequence[PoseResult]) -> UInt8[np.ndarray, "H W 3"]:
-    """The image of the results, with all their poses; as PoseResult.overlay."""
+    """The image with the poses of all results, drawn as by PoseResult.overlay."""
     image = results[0].image
     assert image is not None
     poses = []

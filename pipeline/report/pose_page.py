@@ -1,4 +1,4 @@
-"""The poses of one photograph -> one HTML page that needs nothing outside itself, of at most 1.5 MB."""
+"""The poses of one photograph -> one self-contained HTML page of at most 1.5 MB."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from pipeline.items.poses import Alternative
 Picture = UInt8[np.ndarray, "_H _W 3"]
 
 MAX_BYTES = 1_500_000
-MAX_ALTERNATIVES = 3  # of each pose on the page; pose.json has all
+MAX_ALTERNATIVES = 3  # shown per pose; pose.json has all
 _SIZES = ((1280, 85), (1100, 80), (900, 75), (720, 70), (540, 60))
-"""Longer side (px) and quality of the photograph and its overlay: the first with which the page is small enough."""
+"""Longer side (px) and JPEG quality of photograph and overlay; the first pair that keeps the page small is used."""
 _CARD_QUALITY = 75
 
 
 @dataclass(frozen=True, eq=False)
 class ShownPose:
-    """One result on the page: its line, its matrix if there is a pose, and the card that shows how it was found.
+    """One result on the page: its summary, its matrix if there is a pose, and a figure of how it was found (``card``).
 
     ``alternatives``: best first.
     """
@@ -41,7 +41,7 @@ class ShownPose:
 
 @dataclass(frozen=True, eq=False)
 class PosePage:
-    """What the page shows. ``scene``: an HTML page with the view in space, or "". ``note``: as Dataset.image_note."""
+    """Content of the page. ``scene``: an HTML page with the 3D view, or "". ``note``: as Dataset.image_note."""
 
     title: str
     photograph: Picture
@@ -52,7 +52,7 @@ class PosePage:
     note: str = field(default="")
 
     def html(self) -> str:
-        """The page. Its photograph is as large as fits into ``MAX_BYTES``."""
+        """The page, with the largest photograph that keeps it within ``MAX_BYTES``, if any does."""
         cards = [
             {"name": pose.name, "data": _data_url(pose.card, max(pose.card.shape), _CARD_QUALITY)}
             for pose in self.poses

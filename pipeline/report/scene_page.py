@@ -1,4 +1,4 @@
-"""Mesh, pose, camera -> an HTML page with a 3D view that can be turned, without any link outside itself.
+"""Mesh, pose, camera -> a self-contained HTML page with an interactive 3D view.
 
 The viewer is trimesh's: three.js in one file of 0.7 MB.
 """
@@ -21,15 +21,15 @@ Rgba = tuple[int, int, int, int]
 Pose = Float[np.ndarray, "4 4"]
 
 FACES, TEXTURE_PX = 6000, 256
-"""Limits of the mesh in a page, which keep its size below 0.3 MB."""
+"""Limits of the mesh in a page. They keep the mesh below 0.3 MB."""
 _GREY: Rgba = (160, 165, 172, 255)
 _CAMERA: Rgba = (30, 34, 40, 255)
 _AXES: tuple[Rgba, ...] = ((220, 50, 50, 255), (60, 170, 70, 255), (60, 110, 240, 255))
-_VIEWER_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])  # the viewer's y axis points up, its z axis towards the spectator
+_VIEWER_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])  # the viewer's y axis points up, its z axis towards the user
 
 
 def scene_html(objects: Sequence[tuple[Mesh, Pose]], K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]) -> str:
-    """A page with the objects in their poses (T_cam_obj, mm), their axes, and the camera's pyramid; drag to turn."""
+    """A page with the objects in their poses (T_cam_obj, mm), their axes, and the camera's frustum; drag to turn."""
     scene = trimesh.Scene()
     for mesh, T_cam_obj in objects:
         scene.add_geometry(_geometry(thin_mesh(mesh, FACES, texture_px=TEXTURE_PX), T_cam_obj))
@@ -77,7 +77,7 @@ def _pyramid(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], depth_mm: fl
 
 
 def _look_at(scene: trimesh.Scene, centre: Float[np.ndarray, " 3"], distance_mm: float, size_mm: float) -> None:
-    """Place the viewer's camera to the upper right between the real one and the objects, near enough to see them."""
+    """Place the viewer's camera to the upper right, between the real camera and the objects, and close enough."""
     away_mm = min(max(4 * size_mm, 0.5 * distance_mm), distance_mm)
     eye, middle = centre + away_mm * np.array([0.75, 0.45, 0.5]), 0.9 * centre
     back = (eye - middle) / np.linalg.norm(eye - middle)

@@ -1,4 +1,4 @@
-"""True masks -> masks as detectors make them."""
+"""True masks -> simulated masks of a detector, with typical errors."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ SHARES = {
     "missing": 0.05,
     "box": 0.05,
 }
-"""How often each kind of mask occurs, chosen for plausibility and fitted to no detector. A third is good but for its
-contour, a fifth is of something else or missing, the others are wrong in the ways in which segmentation goes wrong."""
+"""How often each kind of mask occurs, chosen to be plausible, not fitted to a detector. A third only has a rough
+contour, a fifth covers another object or is missing, and the rest have typical errors of segmentation."""
 
 
 def imitate_detector(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) -> tuple[Mask, bool] | None:
-    """A detector's mask of an instance and whether only its box is given; None where the instance is missed.
+    """A simulated mask of an instance, and whether only its box is given; None if the instance is missed.
 
     ``visible``: its visible part; ``silhouette``: its outline without occluders; ``others``: masks of other objects.
     """
@@ -43,20 +43,20 @@ def imitate_detector(visible: Mask, silhouette: Mask, others: Sequence[Mask], rn
 
 
 def box_xywh(mask: Mask) -> list[int]:
-    """First column and row, number of columns and rows."""
+    """The box of a mask: first column, first row, number of columns, number of rows."""
     ys, xs = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return [int(xs[0]), int(ys[0]), int(np.ptp(xs) + 1), int(np.ptp(ys) + 1)]
 
 
 def _wavy(mask: Mask, rng: Rng) -> Mask:
-    """The contour moved in and out by about a pixel and a half."""
+    """Move the contour in and out by about 1.5 px."""
     coarse = rng.normal(0, 1.5, tuple(max(2, n // 12) for n in mask.shape)).astype(np.float32)
     shift = cv2.resize(coarse, mask.shape[::-1], interpolation=cv2.INTER_CUBIC)
     return _signed_distance(mask) > shift
 
 
 def _merge(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) -> Mask:
-    """With a part of what hides it, or else of what is beside it."""
+    """Add a part of the occluder or, without one, of what is beside the object."""
     hidden = silhouette & ~visible
     if hidden.sum() > 20:
         return visible | _dilate(hidden, int(rng.integers(3, 12)))
@@ -67,12 +67,12 @@ def _merge(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) ->
 
 
 def _cut(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) -> Mask:
-    """One side missing, as where a segment ends at an inner edge."""
+    """Remove one side, as when a segment ends at an inner edge."""
     return visible & _half_plane(visible, rng, rng.uniform(0.25, 0.5))
 
 
 def _pierce(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) -> Mask:
-    """With one to three round holes."""
+    """Cut one to three round holes."""
     ys, xs = np.nonzero(visible)
     y, x = np.mgrid[: visible.shape[0], : visible.shape[1]]
     holes = np.zeros_like(visible)
@@ -82,12 +82,12 @@ def _pierce(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) -
 
 
 def _widen(visible: Mask, silhouette: Mask, others: Sequence[Mask], rng: Rng) -> Mask:
-    """Two to five pixels too wide."""
+    """Dilate by two to five pixels."""
     return _dilate(visible, int(rng.integers(2, 6)))
 
 
 def _half_plane(mask: Mask, rng: Rng, share: float) -> Mask:
-    """A half plane in a random direction that leaves this share of the mask's pixels out."""
+    """A half plane in a random direction that excludes this share of the mask's pixels."""
     angle = rng.uniform(0, 2 * np.pi)
     y, x = np.mgrid[: mask.shape[0], : mask.shape[1]]
     along = x * np.cos(angle) + y * np.sin(angle)

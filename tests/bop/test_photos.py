@@ -120,8 +120,8 @@ def test_cameras_of_ros_opencv_and_bop_are_read(folder):
         (ROS.replace("plumb_bob", "equidistant"), "found distortion_model equidistant, needs plumb_bob"),
         ("camera: {f: 3}", "found fields camera, needs camera_matrix or K with 9 numbers, or fx, fy, cx, cy"),
         ("K: [1, 2]", "found 2 numbers, needs camera_matrix or K"),
-        ("[1, 2", "found what cannot be read"),
-        ("!!python/object/apply:os.system [ls]", "found what cannot be read"),
+        ("[1, 2", "found invalid syntax"),
+        ("!!python/object/apply:os.system [ls]", "found invalid syntax"),
     ],
 )
 def test_a_camera_file_that_cannot_be_used_is_named(folder, text, message):

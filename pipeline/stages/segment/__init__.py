@@ -15,18 +15,18 @@ BBox = tuple[float, float, float, float]
 
 
 class Segmenter(Spec, ABC):
-    """Contract of a segment variant. ``makes_masks``: False where every box stays a box."""
+    """Contract of a segment variant. ``makes_masks``: False if boxes are used as they are."""
 
     makes_masks: ClassVar[bool] = True
 
     @abstractmethod
     def __call__(self, rgb: UInt8[np.ndarray, "H W 3"], bbox_xyxy: BBox) -> Bool[np.ndarray, "H W"] | None:
-        """The object's pixels in the image; None where the box says more than what was found in it."""
+        """The object's pixels in the image; None if no useful mask was found, so that the box is used."""
 
     def others(self, rgb: UInt8[np.ndarray, "H W 3"], bbox_xyxy: BBox) -> Iterator[Bool[np.ndarray, "H W"]]:
-        """Further guesses at the mask, best first, for where poses with the first one do not convince."""
+        """Further guesses at the mask, best first, tried while poses are not good enough."""
         return iter(())
 
     def is_enough(self, similarity: float) -> bool:
-        """Whether no further guess is tried after a pose whose cells have this mean cosine with the query's."""
+        """Whether a pose with this mean cosine to the query's features is good enough to stop trying guesses."""
         return True

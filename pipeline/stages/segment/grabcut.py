@@ -19,12 +19,12 @@ MIN_SIDE_PX = 4  # smaller boxes have too few pixels for two colour models
 
 @spec
 class Grabcut(Segmenter):
-    """GrabCut (Rother et al., SIGGRAPH 2004): two colour models, of the box and of what surrounds it, and a graph cut.
+    """GrabCut (Rother et al., SIGGRAPH 2004): colour models of the box and of its surroundings, and a graph cut.
 
-    ``margin``: width of the surrounding frame, in longer sides of the box. ``side``: larger boxes are scaled down to
-    this many pixels a side. ``iterations``: of fitting and cutting. ``min_share``: of the box; a smaller mask is
-    refused, because the cut has then found a part or nothing. ``guesses``: masks that are tried, at most 3, until the
-    cells of a pose have a mean cosine of ``enough`` with the query's. The same image and box give the same masks.
+    ``margin``: width of the surrounding frame, relative to the longer side of the box. ``side``: larger boxes are
+    scaled down to this longer side, px. ``iterations``: of fitting and cutting. ``min_share``: smallest mask, as a
+    share of the box; below it, the cut has failed. ``guesses``: most masks to try, until the features of a pose
+    have a mean cosine of at least ``enough`` with the query's. Deterministic.
     """
 
     kind: ClassVar[str] = "segment.grabcut"
@@ -38,11 +38,11 @@ class Grabcut(Segmenter):
     enough: Fraction = 0.7
 
     def __call__(self, rgb: UInt8[np.ndarray, "H W 3"], bbox_xyxy: BBox) -> Bool[np.ndarray, "H W"] | None:
-        """The object's pixels; None for a mask below ``min_share``, a tiny box, and one that fills the image."""
+        """The object's pixels; None if the mask is below ``min_share`` or the box is tiny or fills the image."""
         return self._segment(rgb, bbox_xyxy, box_mask(bbox_xyxy, rgb.shape[:2]))
 
     def others(self, rgb: UInt8[np.ndarray, "H W 3"], bbox_xyxy: BBox) -> Iterator[Bool[np.ndarray, "H W"]]:
-        """A cut that starts from the ellipse in the box, then the ellipse; with the first at most ``guesses``."""
+        """A cut that starts from the ellipse in the box, then the ellipse; ``guesses`` includes the first cut."""
         ellipse = ellipse_mask(bbox_xyxy, rgb.shape[:2])
         if self.guesses > 1 and (found := self._segment(rgb, bbox_xyxy, ellipse)) is not None:
             yield found
@@ -56,7 +56,7 @@ class Grabcut(Segmenter):
     def _segment(
         self, rgb: UInt8[np.ndarray, "H W 3"], bbox_xyxy: BBox, start: Bool[np.ndarray, "H W"]
     ) -> Bool[np.ndarray, "H W"] | None:
-        """The cut that begins with ``start`` as probable foreground."""
+        """The mask of a cut that starts with ``start`` as probable foreground."""
         (x0, y0, x1, y1), size_hw = bbox_xyxy, rgb.shape[:2]
         frame_px = self.margin * max(x1 - x0, y1 - y0)
         window = pixels_inside((x0 - frame_px, y0 - frame_px, x1 + frame_px, y1 + frame_px), size_hw)
@@ -70,7 +70,7 @@ class Grabcut(Segmenter):
     def _cut(
         self, rgb: UInt8[np.ndarray, "h w 3"], box: Bool[np.ndarray, "h w"], start: Bool[np.ndarray, "h w"]
     ) -> Bool[np.ndarray, "h w"]:
-        """The foreground of a window; outside the box everything is background."""
+        """The foreground of a window; everything outside the box is background."""
         h, w = box.shape
         scale = min(1.0, self.side / max(box.any(0).sum(), box.any(1).sum()))
         size = max(2, round(w * scale)), max(2, round(h * scale))
@@ -96,7 +96,7 @@ def box_mask(bbox_xyxy: BBox, size_hw: tuple[int, ...]) -> Bool[np.ndarray, "H W
 
 
 def ellipse_mask(bbox_xyxy: BBox, size_hw: tuple[int, ...]) -> Bool[np.ndarray, "H W"]:
-    """Pixels whose centre is in the ellipse that touches the box's sides."""
+    """Pixels whose centre is in the ellipse inscribed in the box."""
     x0, y0, x1, y1 = bbox_xyxy
     y, x = np.mgrid[: size_hw[0], : size_hw[1]]
     across, down = (2 * x - x0 - x1) / max(x1 - x0, 1e-9), (2 * y - y0 - y1) / max(y1 - y0, 1e-9)

@@ -13,7 +13,7 @@ from pipeline.stages.segment import BBox, Segmenter
 
 @spec
 class NoSegmentation(Segmenter):
-    """Everything in the box is taken for the object, as in the paper's ablations."""
+    """No mask: everything in the box counts as object, as in the paper's ablations."""
 
     kind: ClassVar[str] = "segment.none"
     version: ClassVar[int] = 1
