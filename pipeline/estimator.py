@@ -153,7 +153,11 @@ class PoseEstimator:
             found = repr(unknown[0]) if unknown else "no object"
             raise BadInput("name", found=found, needed=f"one of {', '.join(self.names)}")
         size_hw = (rgb.shape[0], rgb.shape[1])
-        camera_matrix = parse_K(np.asarray(K, dtype=np.float64).tolist(), "K")
+        try:
+            numbers = np.asarray(K, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise BadInput("K", found=repr(K)[:60], needed="[fx,fy,cx,cy] or a 3 x 3 matrix") from None
+        camera_matrix = parse_K(np.atleast_1d(numbers).tolist(), "K")
         check_own_camera(camera_matrix, size_hw, "K")
         located = {self.names.index(name) + 1: parse_locations(given, size_hw) for name, given in locations.items()}
         targets = tuple(Target(SCENE_ID, IM_ID, obj_id, len(at)) for obj_id, at in sorted(located.items()))

@@ -160,6 +160,13 @@ def test_an_error_names_the_argument(estimator, folder, given, message):
     assert message in str(raised.value)
 
 
+@pytest.mark.parametrize("wrong", ["abc", [[300, 0], [0, 300, 120]], None, 300.0, [300, 300, 160], np.zeros((2, 2, 3))])
+def test_a_camera_that_is_no_matrix_is_refused(estimator, folder, wrong):
+    rgb, mask = read(folder / "shot.png"), read(folder / "mug_mask.png")
+    with pytest.raises(BadInput, match=r"^K: found .*needs "):
+        estimator(rgb, wrong, mask=mask, name="mug")
+
+
 def test_settings_that_do_not_exist_are_refused(folder):
     with pytest.raises(BadInput, match=r"settings: found Could not override 'match\.tpo_k'"):
         PoseEstimator.from_mesh(folder / "mug.ply", settings=["match.tpo_k=3"])
