@@ -15,6 +15,7 @@ from pipeline.bop.masks import decode_rle
 from pipeline.bop.symmetries import SYMMETRIES_VERSION
 from pipeline.confidence.evidence import collect_evidence
 from pipeline.errors import NoPose
+from pipeline.functional.boxes import pixels_inside
 from pipeline.functional.depth_fit import fit_depth
 from pipeline.functional.symmetry import make_canonical
 from pipeline.graph.bank import StoredBank
@@ -245,9 +246,8 @@ class PoseNodes:
         context, image = self.context, (d.scene_id, d.im_id)
         depth_mm, K, model = context.dataset.depth_mm(*image), context.K(image), context.model(d.obj_id)
         if d.rle is None:
-            x0, y0, x1, y1 = np.clip(np.rint(d.bbox_xyxy), 0, None).astype(int)
             mask = np.zeros(depth_mm.shape, dtype=bool)
-            mask[y0 : y1 + 1, x0 : x1 + 1] = True
+            mask[pixels_inside(d.bbox_xyxy, depth_mm.shape)] = True
         else:
             mask = decode_rle(d.rle)
 
