@@ -63,7 +63,7 @@ def collect_evidence(
     if trace.best.score is not None:
         found["value"] = trace.best.score
     if others:
-        found["agreeing"] = 1 - sum(far for far in others) / len(others)
+        found["agreeing"] = 1 - sum(others) / len(others)
         found["rival"] = max((rival.support for rival in rivals), default=0.0)
     return {name: float(value) for name, value in found.items()}, tuple(rivals)
 
