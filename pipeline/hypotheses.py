@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.functional import camera, rigid
-from pipeline.functional.agreement import agreement
 from pipeline.functional.crop_pose import transfer_template_pose
 from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import PairGeometry
 from pipeline.items.online import Hypothesis, Query, TemplateView
+from pipeline.stages.choose import compare_features
 
 
 def select_matched(hypotheses: Sequence[Hypothesis], *, count: int) -> list[Hypothesis]:
@@ -42,10 +42,7 @@ def mean_cosine(hypothesis: Hypothesis, geometry: PairGeometry) -> float:
     """
     if hypothesis.solution is None:
         return -1.0
-    pair, T_cam_obj = geometry.pair, hypothesis.solution.T_cam_obj
-    K_cell = camera.cell_affine(size=geometry.crop_size, cells=pair.query_mask.shape[-1]) @ geometry.K_crop
-    masks = pair.query_mask, pair.template_mask
-    return agreement(pair.query, pair.template, *masks, geometry.points_obj, K_cell, T_cam_obj)[0]
+    return compare_features(hypothesis.solution.T_cam_obj, geometry)[0]
 
 
 def _distance_px(hypothesis: Hypothesis, better: Hypothesis, K_crop: Float[np.ndarray, "3 3"]) -> float:

@@ -183,7 +183,9 @@ class Route:
         inliers = np.zeros(len(on_object), bool)
         inliers[on_object] = solution.inliers
         T_cam_obj = pose_in_image(solution.T_cam_obj, R_plane_cam)
-        T_cam_obj = refit_in_crop(self.stages.solve, query, points_obj[on_object], query_px_img[on_object], T_cam_obj)
+        if self.stages.solve.refits:
+            points, px = points_obj[on_object], query_px_img[on_object]
+            T_cam_obj = refit_in_crop(self.stages.solve, query, points, px, T_cam_obj)
         error_px = reprojection_error_px(points_obj[inliers], query_px_img[inliers], query.K, T_cam_obj)
         return PoseSolution(T_cam_obj, inliers, float(np.sqrt(np.mean(error_px**2))))
 

@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.functional.agreement import agreement
-from pipeline.functional.camera import cell_affine
 from pipeline.items.features import PairGeometry
 from pipeline.items.objects import ObjectModel
 from pipeline.items.online import Hypothesis, Query, Trace
 from pipeline.items.poses import Alternative
 from pipeline.metrics.pose_error import hull_vertices, mssd
+from pipeline.stages.choose import compare_features
 
 NEAR = 0.2
 """Poses whose MSSD is below this share of the diameter count as the same pose."""
@@ -56,7 +55,8 @@ def collect_evidence(
     """
     others, rivals = _compare_hypotheses(trace, extent)
     found = _count_matches(trace.best, query)
-    found |= _compare_features(trace.best, geometry)
+    if trace.best.solution is not None:
+        found["cosine"], found["coverage"] = compare_features(trace.best.solution.T_cam_obj, geometry)
     found |= _compare_silhouettes(trace.best, query, extent)
     found["template_score"] = trace.best.template_score
     found["template_margin"] = trace.match.margin
@@ -113,18 +113,6 @@ def _count_matches(best: Hypothesis, query: Query) -> dict[str, float]:
         "crop_px": query.crop.mask.shape[-1] / zoom,
         "mask_share": float(query.crop.mask.float().mean()),
     }
-
-
-def _compare_features(best: Hypothesis, geometry: PairGeometry) -> dict[str, float]:
-    """Agreement of the features in the final pose: mean cosine, and the share of the query that is covered."""
-    if best.solution is None:
-        return {}
-    pair = geometry.pair
-    K_cell = cell_affine(size=geometry.crop_size, cells=pair.query_mask.shape[-1]) @ geometry.K_crop
-    masks = pair.query_mask, pair.template_mask
-    T_cam_obj = best.solution.T_cam_obj
-    cosine, coverage = agreement(pair.query, pair.template, *masks, geometry.points_obj, K_cell, T_cam_obj)
-    return {"cosine": cosine, "coverage": coverage}
 
 
 def _compare_silhouettes(best: Hypothesis, query: Query, extent: Extent) -> dict[str, float]:

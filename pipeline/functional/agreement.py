@@ -13,7 +13,7 @@ from pipeline.functional.rigid import transform
 from pipeline.functional.similarity import l2_normalize
 
 
-def agreement(
+def measure_agreement(
     query: Float[Tensor, "d h w"],
     template: Float[Tensor, "d h w"],
     query_mask: Bool[Tensor, "h w"],

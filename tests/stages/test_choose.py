@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.errors import BadInput
-from pipeline.functional.agreement import agreement
+from pipeline.functional.agreement import measure_agreement
 from pipeline.items.features import FusedPair, PairGeometry
 from pipeline.spec import build
 from pipeline.stages.choose.agreement import Agreement
@@ -48,7 +48,7 @@ def judged(spec, T: np.ndarray, inliers: int = 20, query_mask: torch.Tensor | No
 def values(T: np.ndarray, query_mask: torch.Tensor) -> tuple[float, float]:
     pair, K_cell = pair_of(query_mask), np.diag([CELLS / SIZE, CELLS / SIZE, 1]) @ K_CROP
     K_cell[:2, 2] = (CELLS - 1) / 2
-    return agreement(pair.query, pair.template, pair.query_mask, pair.template_mask, points(), K_cell, T)
+    return measure_agreement(pair.query, pair.template, pair.query_mask, pair.template_mask, points(), K_cell, T)
 
 
 def test_the_true_pose_agrees_in_every_cell():

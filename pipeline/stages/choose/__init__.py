@@ -7,6 +7,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.functional.agreement import measure_agreement
+from pipeline.functional.camera import cell_affine
 from pipeline.items.features import PairGeometry
 from pipeline.spec import Spec
 
@@ -17,3 +19,11 @@ class HypothesisScorer(Spec, ABC):
     @abstractmethod
     def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
         """Score of a pose (mm), at least 0; higher is better. Never raises NoPose."""
+
+
+def compare_features(T_cam_obj: Float[np.ndarray, "4 4"], geometry: PairGeometry) -> tuple[float, float]:
+    """Mean cosine and covered share of the query's foreground under a pose (mm): functional.agreement, of a pair."""
+    pair = geometry.pair
+    K_cell = cell_affine(size=geometry.crop_size, cells=pair.query_mask.shape[-1]) @ geometry.K_crop
+    masks = pair.query_mask, pair.template_mask
+    return measure_agreement(pair.query, pair.template, *masks, geometry.points_obj, K_cell, T_cam_obj)

@@ -8,11 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.functional.agreement import agreement
-from pipeline.functional.camera import cell_affine
 from pipeline.items.features import PairGeometry
 from pipeline.spec import NonNegativeFloat, PositiveFloat, spec
-from pipeline.stages.choose import HypothesisScorer
+from pipeline.stages.choose import HypothesisScorer, compare_features
 
 
 @spec
@@ -34,9 +32,5 @@ class Agreement(HypothesisScorer):
 
     def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
         """The product; 0 where the template lands outside the query's foreground."""
-        pair = geometry.pair
-        K_cell = cell_affine(size=geometry.crop_size, cells=pair.query_mask.shape[-1]) @ geometry.K_crop
-        cosine, coverage = agreement(
-            pair.query, pair.template, pair.query_mask, pair.template_mask, geometry.points_obj, K_cell, T_cam_obj
-        )
+        cosine, coverage = compare_features(T_cam_obj, geometry)
         return max(cosine, 0.0) ** self.cosine_power * coverage * inliers**self.inlier_power

@@ -30,6 +30,11 @@ class Solver(Spec, ABC):
 
     plane: Plane = "image"
 
+    @property
+    def refits(self) -> bool:
+        """Whether ``refit`` follows the solution."""
+        return False
+
     @abstractmethod
     def __call__(
         self,
@@ -46,7 +51,7 @@ class Solver(Spec, ABC):
         K_crop: Float[np.ndarray, "3 3"],
         T_crop_obj: Float[np.ndarray, "4 4"],
     ) -> Float[np.ndarray, "4 4"]:
-        """The solution with the precision of the features, a matter of the crop's pixels; by default unchanged."""
+        """The pose refitted to matches in pixels of the crop, the scale of its features; unchanged by default."""
         return T_crop_obj
 
 

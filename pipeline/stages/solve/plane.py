@@ -36,7 +36,7 @@ def refit_in_crop(
     px_img: Float[np.ndarray, "m 2"],
     T_cam_obj: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "4 4"]:
-    """T_cam_obj refitted to object points and pixels of the photograph, in the crop's camera (Solver.refit)."""
+    """T_cam_obj (mm) refitted to object points and pixels of the photograph, in the crop's camera (Solver.refit)."""
     K_crop, R_crop_cam = camera.crop_camera(query.A_crop_img, query.K)
     px_crop = camera.apply_homography(query.A_crop_img, px_img)
     T_crop_obj = rigid.rigid(R_crop_cam, np.zeros(3)) @ T_cam_obj

@@ -54,6 +54,11 @@ class Poselib(RansacSolver):
             return None
         return rigid(nearest_rotation(np.asarray(pose.R)), np.asarray(pose.t))
 
+    @property
+    def refits(self) -> bool:
+        """See Solver."""
+        return self.refit_px > 0
+
     def refit(
         self,
         points_obj: Float[np.ndarray, "m 3"],
@@ -62,8 +67,6 @@ class Poselib(RansacSolver):
         T_crop_obj: Float[np.ndarray, "4 4"],
     ) -> Float[np.ndarray, "4 4"]:
         """The minimum of a Cauchy loss over matches within three times its scale; unchanged with too few of them."""
-        if not self.refit_px:
-            return T_crop_obj
         near = reprojection_error_px(points_obj, px_crop, K_crop, T_crop_obj) < 3 * self.refit_px
         if near.sum() < self.min_inliers:
             return T_crop_obj
