@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,23 +20,20 @@ from pipeline.bop.images import (
     read_orientation,
     read_rgb,
 )
-from pipeline.bop.jsonio import abbreviate, describe_place, get_integer, read_json
+from pipeline.bop.jsonio import describe_place, read_json
 from pipeline.bop.layout import check_folders, check_scene_folder, check_sensor_name, find_model
 from pipeline.bop.lens import describe_distortion
 from pipeline.bop.models import ModelInfo, check_model_files, compare_diameters, read_model, read_models_info
+from pipeline.bop.projection import check_projections
 from pipeline.bop.scene import Box, GroundTruth, Scene, check_K
+from pipeline.bop.targets import count_instances, names_images_only, parse_images, parse_targets
 from pipeline.errors import BadInput
-from pipeline.functional.camera import project
-from pipeline.functional.rigid import transform
 from pipeline.io.digests import file_exists
 from pipeline.io.meshes import prepared_digest
 from pipeline.items.objects import MeshFacts, ObjectModel
 from pipeline.items.views import Image, Target
 from pipeline.spec import FaceCount, digest, spec
 
-# Box diagonals. The largest offset over the targets of LM-O and YCB-V in the tests is 0.13; a K for an image of half
-# the size gives 0.9 or more.
-_MAX_OFFSET = 0.5
 BOP_WIDTH_PX = {"lm": 640, "lmo": 640, "ycbv": 640, "tless": 720, "tudl": 640, "icbin": 640, "hb": 640, "itodd": 1280}
 """Widths of BOP's test images, used when scoring without the images."""
 
@@ -309,12 +304,12 @@ def open_dataset(
     dataset = Dataset(name, root, split, models, infos, sensor=check_sensor_name(sensor))
     path = None if targets is None else root / targets
     records = None if path is None or not file_exists(path) else read_json(path)
-    if path is not None and isinstance(records, list) and _are_images(records):
-        dataset = _use_annotated_objects(dataset, path, records)
-    elif path is not None and records is not None:
-        dataset = replace(dataset, targets=_read_targets(path, records))
-    else:
+    if path is None or records is None:
         dataset = replace(dataset, targets=_list_annotated_targets(dataset))
+    elif names_images_only(records):
+        dataset = _use_annotated_objects(dataset, path, records)
+    else:
+        dataset = replace(dataset, targets=parse_targets(path, records))
     for obj_id in dataset.object_ids:
         check_model_files(dataset.model_path(obj_id), obj_id, dataset.models_info)
     for scene_id, im_id in dataset.images if photographs else ():
@@ -322,69 +317,35 @@ def open_dataset(
     return dataset
 
 
-def _are_images(records: list[Any]) -> bool:
-    """Whether these are targets of BOP24's detection tasks: images, without the objects to find there."""
-    return bool(records) and all(_is_image(record) for record in records)
-
-
-def _is_image(record: Any) -> bool:
-    return isinstance(record, dict) and {"scene_id", "im_id"} <= record.keys() and "obj_id" not in record
-
-
 def _use_annotated_objects(dataset: Dataset, path: Path, records: list[Any]) -> Dataset:
     """The dataset with every annotated instance of the images as a target, and a warning that says so."""
-    images = set()
-    for index, record in enumerate(records):
-        where = describe_place(path, target=index)
-        images.add((get_integer(record, "scene_id", where), get_integer(record, "im_id", where)))
-    scenes = sorted({scene_id for scene_id, _ in images})
-    if missing := [scene_id for scene_id in scenes if not dataset.has_ground_truth(scene_id)]:
+    images = sorted(parse_images(path, records))
+    if missing := [scene_id for scene_id, _ in images if not dataset.has_ground_truth(scene_id)]:
         found = f"targets without obj_id (BOP24's detection tasks), and no annotations in scene {missing[0]}"
         raise BadInput(path, found=found, needed="scene_id, im_id, obj_id, inst_count: test_targets_bop19.json")
-    targets = _list_annotated_targets(dataset, images)
+    targets = _require_targets(dataset, count_instances((dataset.scene(s), i) for s, i in images))
     warning = f"{path.name}: targets have no obj_id (BOP24's detection tasks); the annotated objects are the targets"
     return replace(dataset, targets=targets, warnings=(warning,))
 
 
-def _read_targets(path: Path, records: Any) -> tuple[Target, ...]:
-    if not isinstance(records, list) or not records:
-        raise BadInput(path, found=abbreviate(records), needed="a list of targets: scene_id, im_id, obj_id, inst_count")
-    targets = []
-    for index, record in enumerate(records):
-        where = describe_place(path, target=index)
-        ids = [get_integer(record, name, where) for name in ("scene_id", "im_id", "obj_id", "inst_count")]
-        if min(ids) < 0 or ids[-1] < 1:
-            raise BadInput(where, found=abbreviate(record), needed="ids >= 0 and inst_count >= 1")
-        targets.append(Target(*ids))
-    repeated = [key for key, n in Counter((t.scene_id, t.im_id, t.obj_id) for t in targets).items() if n > 1]
-    if repeated:
-        scene_id, im_id, obj_id = repeated[0]
-        where = describe_place(path, scene=scene_id, image=im_id, object=obj_id)
-        raise BadInput(where, found="the target twice", needed="one entry with its inst_count")
-    return _sort_targets(targets)
-
-
-def _list_annotated_targets(dataset: Dataset, images: set[tuple[int, int]] | None = None) -> tuple[Target, ...]:
-    """One target per object and image, with as many instances as are annotated. ``images``: None for all."""
+def _list_annotated_targets(dataset: Dataset) -> tuple[Target, ...]:
+    """Every annotated instance of every image."""
     split = dataset.root / dataset.split
-    folders = sorted(p for p in split.iterdir() if p.is_dir() and p.name.isdigit())
-    scene_ids = [int(folder.name) for folder in folders] if images is None else sorted({s for s, _ in images})
-    if images is None and folders and not any(map(dataset.has_ground_truth, scene_ids)):
+    scene_ids = sorted(int(path.name) for path in split.iterdir() if path.is_dir() and path.name.isdigit())
+    if scene_ids and not any(map(dataset.has_ground_truth, scene_ids)):
         found = "neither a targets file nor annotations (scene_gt.json), as in BOP's test sets"
         needed = f"dataset.targets, a file of {dataset.root} with scene_id, im_id, obj_id, inst_count"
         raise BadInput(split, found=found, needed=needed)
-    targets = []
-    for scene in map(dataset.scene, scene_ids):
-        for im_id in scene.annotations if images is None else sorted(i for s, i in images if s == scene.scene_id):
-            counts = Counter(gt.obj_id for gt in scene.ground_truth(im_id))
-            targets += [Target(scene.scene_id, im_id, obj_id, n) for obj_id, n in counts.items()]
+    scenes = map(dataset.scene, scene_ids)
+    return _require_targets(dataset, count_instances((scene, i) for scene in scenes for i in scene.annotations))
+
+
+def _require_targets(dataset: Dataset, targets: tuple[Target, ...]) -> tuple[Target, ...]:
+    """The targets. Raises BadInput if there are none."""
     if not targets:
+        split = dataset.root / dataset.split
         raise BadInput(split, found="no annotated image", needed="a targets file, or scenes with scene_gt.json")
-    return _sort_targets(targets)
-
-
-def _sort_targets(targets: Sequence[Target]) -> tuple[Target, ...]:
-    return tuple(sorted(targets, key=lambda t: (t.scene_id, t.im_id, t.obj_id)))
+    return targets
 
 
 def _check_image(dataset: Dataset, scene_id: int, im_id: int) -> None:
@@ -392,32 +353,5 @@ def _check_image(dataset: Dataset, scene_id: int, im_id: int) -> None:
     K, size_hw = dataset.K(scene_id, im_id), dataset.image_size(scene_id, im_id)
     where = dataset.where_camera(scene_id, im_id)
     check_K(K, size_hw, where)
-    if not dataset.has_ground_truth(scene_id):
-        return
-    found = [_projection_offset(dataset, gt, K, size_hw) for gt in dataset.ground_truth(scene_id, im_id)]
-    offsets = [offset for offset in found if offset is not None]
-    wrong = sum(offset > _MAX_OFFSET for offset in offsets)
-    if wrong > len(offsets) / 2:
-        raise BadInput(
-            where,
-            found=f"a K that projects {wrong} of {len(offsets)} annotated objects away from their boxes",
-            needed=f"the K of this image of {size_hw[1]} x {size_hw[0]} (width x height)",
-        )
-
-
-def _projection_offset(
-    dataset: Dataset, gt: GroundTruth, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]
-) -> float | None:
-    """Distance between an instance's projected centre and the centre of its annotated box, in box diagonals.
-
-    A large value reveals a K of another image size, which K alone does not. None if the box is not fully inside the
-    image or models_info.json has no centre.
-    """
-    info, (h, w) = dataset.models_info.get(gt.obj_id), size_hw
-    if info is None or info.centre is None or gt.bbox_obj_xyxy is None:
-        return None
-    low, high = np.reshape(gt.bbox_obj_xyxy, (2, 2))
-    centre_cam = transform(gt.T_cam_obj, info.centre)
-    if low.min() < 0.5 or high[0] > w - 1.5 or high[1] > h - 1.5 or centre_cam[2] <= 0:
-        return None
-    return float(np.linalg.norm(project(K, centre_cam) - (low + high) / 2) / np.linalg.norm(high - low))
+    if dataset.has_ground_truth(scene_id):
+        check_projections(dataset.ground_truth(scene_id, im_id), dataset.models_info, K, size_hw, where)
