@@ -35,7 +35,7 @@ class CameraFile:
     size_hw: tuple[int, int] | None = None
 
     def check_size(self, size_hw: tuple[int, int], where: str) -> None:
-        """Raise BadInput if K belongs to images of another size."""
+        """Raise BadInput if K was calibrated for images of another size."""
         if self.size_hw is not None and self.size_hw != size_hw:
             (h, w), (own_h, own_w) = size_hw, self.size_hw
             found = f"the camera of images of {own_w} x {own_h}"
@@ -70,7 +70,7 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def estimate_camera(path: Path, size_hw: tuple[int, int]) -> CameraFile:
-    """A camera guessed from the 35 mm equivalent focal length in EXIF. Raises BadInput if it is missing."""
+    """A rough camera from the 35 mm equivalent focal length in EXIF data. Raises BadInput if that is missing."""
     try:
         with PIL.Image.open(path, formats=IMAGE_FORMATS) as image:
             focal_mm = image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_LENGTH_35MM)

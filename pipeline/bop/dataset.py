@@ -40,10 +40,10 @@ BOP_WIDTH_PX = {"lm": 640, "lmo": 640, "ycbv": 640, "tless": 720, "tudl": 640, "
 
 @spec
 class DatasetConfig:
-    """Which dataset, and where. ``root`` is only a location: keys depend on the contents of files, not on it.
+    """Name and location of a dataset. Keys depend on the contents of its files, not on ``root``.
 
-    ``sensor``: the sensor whose files are read, in datasets whose scenes have files of several.
-    ``simplify``: most faces of a mesh, None for all.
+    ``sensor``: which sensor's files to read, in datasets whose scenes were recorded by several.
+    ``simplify``: maximum number of faces of a mesh; None keeps all.
     """
 
     name: str
@@ -68,9 +68,9 @@ class Dataset:
     """A BOP dataset whose targets have images, cameras and models. Pixels and meshes are read on demand.
 
     ``targets`` are sorted by scene, image and object; ``models_info`` is empty without models_info.json. ``warnings``:
-    results of sanity checks when it was opened. ``simplify``: most faces of a mesh from which templates are rendered,
-    None for all; scores use the mesh as it is. Every method raises BadInput for input that cannot be used, in one line
-    with the file, scene, image and field.
+    results of sanity checks when it was opened. ``simplify``: maximum number of faces of the meshes that templates are
+    rendered from (None: all faces); scores use the full meshes. Unusable input raises BadInput, one line that names the
+    file, scene, image and field.
     """
 
     name: str
@@ -111,30 +111,30 @@ class Dataset:
 
     @property
     def requires_pose(self) -> bool:
-        """Whether a run without a single pose has failed, rather than measured that there is none."""
+        """Whether a run that finds no pose at all counts as failed."""
         return False
 
     @property
     def gives_depth(self) -> bool:
-        """Whether the configuration itself names a depth image, so that poses are to be fitted to it."""
+        """Whether the user gave a depth image; poses are then fitted to it."""
         return False
 
     @property
     def finds_symmetries(self) -> bool:
-        """Whether symmetries are found on the meshes, because nothing states them."""
+        """Whether symmetries have to be detected on the meshes because no file lists them."""
         return False
 
     @property
     def image_note(self) -> str:
-        """How images were changed after reading, for the captions of pictures; "" if they were not."""
+        """How images were changed after reading, for figure captions; "" if they were not."""
         return ""
 
     def image_name(self, scene_id: int, im_id: int) -> str:
-        """What messages call an image."""
+        """Name of an image in messages."""
         return f"scene {scene_id}, image {im_id}"
 
     def object_name(self, obj_id: int) -> str:
-        """What messages call an object."""
+        """Name of an object in messages."""
         return f"object {obj_id}"
 
     def scene(self, scene_id: int) -> Scene:
@@ -173,9 +173,9 @@ class Dataset:
         return count_frames(self.image_path(scene_id, im_id))
 
     def image_width(self, scene_id: int, im_id: int) -> int:
-        """Width of the image, px: of its file, its depth image, camera*.json, or BOP's known width, in this order.
+        """Width of the image, px: from its file, its depth image, camera*.json or BOP_WIDTH_PX, in this order.
 
-        Raises BadInput if none of them gives it.
+        Raises BadInput if none of them has it.
         """
         for find_file in (self.image_path, self.depth_path):
             try:
@@ -196,11 +196,11 @@ class Dataset:
         return self.scene(scene_id).camera(im_id).K
 
     def distortion(self, scene_id: int, im_id: int) -> str:
-        """What the camera's record, or else camera*.json, says of distortion that is not applied; "" for none."""
+        """Warning about distortion stated in the camera's record or camera*.json, which is not applied; "" for none."""
         return self.scene(scene_id).camera(im_id).distortion or self._root_distortion
 
     def _root_cameras(self) -> list[dict[str, Any]]:
-        """Contents of the files camera*.json, or of the sensor's, which describe the cameras as a whole."""
+        """Contents of the dataset's camera*.json files; of one file only if a sensor is chosen and has its own."""
         own = self.root / f"camera_{self.sensor}.json"
         paths = [own] if self.sensor and file_exists(own) else sorted(self.root.glob("camera*.json"))
         contents = [read_json(path) for path in paths]
@@ -208,8 +208,8 @@ class Dataset:
 
     @cached_property
     def _root_distortion(self) -> str:
-        """What the only file camera*.json says of distortion; several are of several sensors."""
-        with suppress(BadInput):  # the file is not needed otherwise
+        """Warning about distortion from the only camera*.json; "" if there are several, one per sensor."""
+        with suppress(BadInput):  # nothing else needs this file
             records = self._root_cameras()
             return describe_distortion(records[0]) if len(records) == 1 else ""
         return ""
@@ -262,7 +262,7 @@ class Dataset:
         return read_model(path, obj_id, infos, distances_mm=self._distances_mm(obj_id), simplify=simplify)
 
     def model_warning(self, obj_id: int, facts: MeshFacts) -> str:
-        """What models_info.json states otherwise than the mesh, "" for nothing."""
+        """Where models_info.json contradicts the mesh; "" if it does not."""
         info = self.models_info.get(obj_id)
         return "" if info is None else compare_diameters(self.model_path(obj_id), facts, info)
 
@@ -294,7 +294,7 @@ def open_dataset(
 ) -> Dataset:
     """The dataset at ``root``, after checking that every target has an image, a camera and a model.
 
-    ``photographs`` False: do not check images, which scoring does not need. ``models``: folder of the meshes (T-LESS:
+    ``photographs``: also check the images, which scoring does not need. ``models``: folder of the meshes (T-LESS:
     models_cad or models_reconst). ``targets``: file of the targets; with None or a missing file, every annotated
     instance of every image is a target. ``sensor``: see DatasetConfig. Reads only JSON files and image headers. Raises
     BadInput at the first error.

@@ -1,6 +1,6 @@
 """Detections file + targets -> warnings, or an error when most entries share one mistake.
 
-Each check compares what an entry says twice: ids with those of the targets, the box with the image and with the mask.
+Each check cross-checks redundant information: ids against the targets, boxes against their images and masks.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pipeline.items.views import Target
 
 Xywh = tuple[float, float, float, float]
 
-_MAX_CHECKED, _MAX_DECODED = 200, 20  # entries compared with their masks, and masks looked at pixel by pixel
+_MAX_CHECKED, _MAX_DECODED = 200, 20  # entries whose boxes are compared with their masks, and masks that are decoded
 _AGREE, _FITS = 0.5, 0.7
-"""IoU of box and mask above which they agree (a box of the full silhouette may be larger than the visible mask), and
-above which another reading of the box explains a disagreement."""
-_BEYOND = 0.03  # share of the image's longer side that polygons may exceed it by
+"""Minimum IoU for box and mask to agree (a box of the full silhouette may exceed the visible mask), and for another box
+format to explain a disagreement."""
+_BEYOND = 0.03  # tolerance for polygons outside the image, as a share of its longer side
 _OUTSIDE = 0.1  # share of a box outside the image above which it does not fit the image
 
 _CORNERS = "two corners (x0, y0, x1, y1)"
@@ -41,7 +41,7 @@ _ELSEWHERE = "elsewhere"
 
 
 def check_ids(path: Path, entries: Sequence[Entry], targets: Sequence[Target]) -> list[str]:
-    """Warnings about ids that fit few of the dataset's targets. Raises BadInput if no entry fits any."""
+    """Warnings about ids that match few of the dataset's targets. Raises BadInput if no entry matches any."""
     if not entries:
         return [f"{path.name}: the file has no detections"]
     wanted = {(t.scene_id, t.im_id, t.obj_id) for t in targets}
@@ -54,7 +54,7 @@ def check_ids(path: Path, entries: Sequence[Entry], targets: Sequence[Target]) -
     if shift := _find_shift(found_images, images):
         causes.append(f"image_id looks shifted: image ids are {shift:+d}")
     if any(e.target in wanted for e in entries):
-        is_sure = len(found_objects) > 1 or len(found_images) > 1  # a single id is next to another by chance
+        is_sure = len(found_objects) > 1 or len(found_images) > 1  # a single id may be off by one by chance
         return [f"{path.name}: {cause}" for cause in causes] if is_sure else []
     if not found_objects & objects and not any("category_id" in cause for cause in causes):
         counts_from_0 = 0 in found_objects and 0 not in objects
@@ -70,8 +70,8 @@ def check_boxes_and_masks(
 ) -> list[str]:
     """Warnings about boxes and masks of entries that belong to targets. ``image_size``: (scene_id, im_id) -> (h, w).
 
-    Raises BadInput if most boxes are in another format, most masks run along rows instead of columns, or most boxes
-    lie away from their masks. Entries that cannot be read are left to the caller.
+    Raises BadInput if most boxes are in another format, most masks are run-length encoded by rows instead of columns,
+    or most boxes do not overlap their masks. Unreadable entries are left to the caller.
     """
     if not entries:
         return []
@@ -104,7 +104,7 @@ def check_boxes_and_masks(
 
 
 def _check_polygons(path: Path, sample: Sequence[tuple[Entry, tuple[int, int]]]) -> list[str]:
-    """A warning about polygons that leave their images. Raises BadInput if all would fit with y before x."""
+    """A warning about polygons outside their images. Raises BadInput if all would fit with x and y exchanged."""
     read = ((e.index, _read_corners(e.record, hw), hw) for e, hw in sample)
     corners = {index: (found, hw) for index, found, hw in read if found is not None}
     outside = [index for index, (found, hw) in corners.items() if _leaves(found, hw)]
@@ -119,7 +119,7 @@ def _check_polygons(path: Path, sample: Sequence[tuple[Entry, tuple[int, int]]])
 
 
 def _check_against_images(path: Path, boxes: Sequence[tuple[int, Xywh, tuple[int, int]]]) -> list[str]:
-    """Warnings about boxes without masks. Raises BadInput if most leave the image and all would fit as corners."""
+    """Warnings about boxes without masks. Raises BadInput if most exceed the image and all would fit as corners."""
     outside = [index for index, box, size_hw in boxes if _outside_share(box, size_hw) > _OUTSIDE]
     corners = sum(_are_corners(box, size_hw) for _, box, size_hw in boxes)
     if boxes and corners == len(boxes) and (2 * len(outside) > len(boxes) or len(boxes) > 2):
@@ -157,7 +157,7 @@ def _raise_if_most(path: Path, faults: dict[int, str], total: int, boxes: dict[i
 
 
 def _compare(box: Xywh, mask_box: Xywh) -> str:
-    """Which other reading of the box fits the mask, _ELSEWHERE if they do not overlap, "" if they may agree."""
+    """The box format that would fit the mask, _ELSEWHERE if they do not overlap, "" if they may agree."""
     if _iou(box, mask_box) >= _AGREE:
         return ""
     reading, iou = max(((name, _iou(read(box), mask_box)) for name, read in _READINGS.items()), key=lambda r: r[1])
@@ -173,12 +173,12 @@ def _fits_by_rows(box: Xywh, mask: Bool[np.ndarray, "H W"]) -> bool:
 
 
 def _runs_along_rows(mask: Bool[np.ndarray, "H W"]) -> bool:
-    """Whether the runs make a compact shape along rows, and noise along columns."""
+    """Whether the runs decode to a compact shape by rows, but to noise by columns."""
     return _perimeter(mask) > 2 * _perimeter(_reread_by_rows(mask))
 
 
 def _reread_by_rows(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """The mask that the same runs make when they go along rows."""
+    """The same runs decoded by rows."""
     return mask.T.reshape(mask.shape)
 
 
@@ -244,7 +244,7 @@ def _iou(a: Xywh, b: Xywh) -> float:
 
 
 def _find_shift(found: set[Any], wanted: set[Any]) -> int:
-    """1 or -1 if all ids are wanted after adding it to their last number, and are not as they are; 0 otherwise."""
+    """The shift, 1 or -1, that makes the last number of every id match; 0 if they match already or neither helps."""
     if found <= wanted:
         return 0
     return next((s for s in (1, -1) if {(*key[:-1], key[-1] + s) for key in found} <= wanted), 0)

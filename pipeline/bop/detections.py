@@ -37,9 +37,9 @@ class Entry:
 def read_entries(path: Path, targets: Sequence[Target]) -> tuple[list[Entry], list[str]]:
     """Entries of a detections file in file order, and warnings. Boxes and masks are not validated yet.
 
-    Also reads a COCO annotation file; its images are found by the number in their file name, else by their id. Ids may
-    be written as text ("000003"). If no entry has a score, all get 1. ``targets``: if they have a single scene, it is
-    the scene of COCO annotations without one. Raises BadInput for any other format.
+    Also reads COCO annotation files; images are identified by the number in their file name, else by their id. Ids may
+    be strings ("000003"). If no entry has a score, all get 1. ``targets``: if they lie in a single scene, COCO
+    annotations that name no scene belong to it. Raises BadInput for any other format.
     """
     content = read_json(path)
     if isinstance(content, dict) and isinstance(content.get("images"), list):
@@ -70,7 +70,7 @@ def _parse_entry(path: Path, index: int, record: Any, *, no_scores: bool) -> Ent
 
 
 def _get_id(record: Any, field: str, where: str) -> int:
-    """An integer, or a text that is one."""
+    """An integer, or a string that spells one."""
     value = get_field(record, field, where)
     if isinstance(value, str) and _DIGITS.fullmatch(value):
         return int(value)
@@ -78,7 +78,7 @@ def _get_id(record: Any, field: str, where: str) -> int:
 
 
 def _list_annotations(path: Path, content: dict[str, Any], scene_ids: set[int]) -> list[dict[str, Any]]:
-    """Annotations of a COCO file as detections, with the scene and image that their image's file name gives."""
+    """Annotations of a COCO file as detections; scene and image are taken from the file name of their image."""
     annotations = get_field(content, "annotations", str(path))
     if not isinstance(annotations, list):
         raise BadInput(f"{path}, field annotations", found=type(annotations).__name__, needed="a list")
@@ -97,14 +97,14 @@ def _list_annotations(path: Path, content: dict[str, Any], scene_ids: set[int]) 
 
 
 def _parse_file_name(file_name: Any) -> tuple[int | None, int | None]:
-    """Scene and image of "000002/rgb/000003.png"; None for what the name does not say."""
+    """Scene and image of "000002/rgb/000003.png"; None for either that the name lacks."""
     path = PurePosixPath(file_name if isinstance(file_name, str) else "")
     scenes = [part for part in path.parts[:-1] if len(part) == 6 and _DIGITS.fullmatch(part)]
     return int(scenes[-1]) if scenes else None, int(path.stem) if _DIGITS.fullmatch(path.stem) else None
 
 
 def _find_scene(path: Path, where: str, annotation: dict[str, Any], scene_ids: set[int]) -> int:
-    """The scene of an annotation: its own field, the folder that the file lies in, or the only scene of the targets."""
+    """The scene of an annotation: its own field, the folder of its image, or the only scene of the targets."""
     if "scene_id" in annotation:
         return _get_id(annotation, "scene_id", where)
     folder = path.absolute().parent.name
@@ -117,7 +117,7 @@ def _find_scene(path: Path, where: str, annotation: dict[str, Any], scene_ids: s
 
 
 def write_detections(path: Path, detections: Sequence[Detection]) -> None:
-    """Write all detections without a defect; masks as uncompressed RLE."""
+    """Write all usable detections; masks as uncompressed RLE."""
     write_json(path, [_format_detection(d) for d in detections if d.defect is None])
 
 
@@ -127,7 +127,7 @@ def _format_detection(d: Detection) -> dict[str, Any]:
         "scene_id": d.scene_id,
         "image_id": d.im_id,
         "category_id": d.obj_id,
-        "bbox": [x0 + 0.5, y0 + 0.5, x1 - x0, y1 - y0],  # the first pixel, as bop/scene.py reads it
+        "bbox": [x0 + 0.5, y0 + 0.5, x1 - x0, y1 - y0],  # index of the first pixel, the inverse of bop/scene.py
         "score": d.score,
         "time": d.time_s,
     }

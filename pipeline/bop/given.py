@@ -32,8 +32,8 @@ _FACTORS: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 class MeshFiles:
     """Meshes of the objects 1, 2, ...; ``scale`` multiplies their vertices, ``simplify`` limits the faces of each.
 
-    ``names``: of the objects; by default the names of the files. ``units``: of the files; "auto" takes a mesh as
-    metres, with a warning, if its diameter is below 3, otherwise as millimetres.
+    ``names``: of the objects, by default those of the files. ``units``: of the files; "auto" assumes metres, with a
+    warning, for a diameter below 3, and millimetres otherwise.
     """
 
     paths: tuple[Path, ...] = ()
@@ -78,7 +78,7 @@ class MeshFiles:
 
 @lru_cache(maxsize=64)
 def _diameter_in_file(path: Path, content: str) -> float:
-    """The diameter of a mesh file, in the file's own unit. ``content``: its digest, which keys the memo."""
+    """The diameter of a mesh file, in the file's own unit. ``content``: its digest, part of the cache key."""
     return prepare_mesh(path)[1].diameter_mm
 
 
@@ -146,7 +146,7 @@ def parse_K(K: Sequence[Any], where: str) -> Float[np.ndarray, "3 3"]:
 
 
 def check_own_camera(K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int], where: str) -> None:
-    """Raise BadInput for a K that cannot belong to the image: without ground truth, no later check can notice."""
+    """Raise BadInput for a K that cannot belong to the image; without ground truth, no later check would notice."""
     if pixels := denormalize_camera(K, size_hw):
         fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         fitting = ",".join(f"{v:.6g}" for v in pixels)

@@ -1,6 +1,6 @@
 """Image files of a BOP dataset as arrays.
 
-Every image of every format (photographs, masks, depth images) is turned upright as its EXIF orientation says.
+All images (photographs, masks, depth images, of any format) are rotated upright by their EXIF orientation.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def read_mask(path: Path, *, label: int | None = None) -> Bool[np.ndarray, "H W"]:
-    """The pixels of the object: not black, or opaque if the mask is drawn in the alpha channel only.
+    """The pixels of the object: not black, or opaque if the mask is in the alpha channel only.
 
-    ``label``: the value to select in an image of labels. bop.pixels has the rules for soft edges and compression.
+    ``label``: the value to select in an image of labels. See bop.pixels for soft edges and compression.
     """
     with _open(path) as image:
         if label is not None and image.mode == "P":
@@ -69,20 +69,20 @@ def read_depth(path: Path, depth_scale: float) -> Float32[np.ndarray, "H W"]:
     return (values * depth_scale).astype(np.float32)
 
 
-PIL.Image.MAX_IMAGE_PIXELS = MAX_MEGAPIXELS * 10**6  # PIL's own limit of 179 would call a large photograph an attack
+PIL.Image.MAX_IMAGE_PIXELS = MAX_MEGAPIXELS * 10**6  # PIL's own limit of 179 reports a large photograph as an attack
 warnings.filterwarnings("ignore", category=PIL.Image.DecompressionBombWarning)  # check_megapixels reports it
 _ANIMATED = ("GIF", "PNG", "TIFF", "WEBP")
 _ORIENTATION_TAG = 0x0112
-_EXIF_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")  # keywords of PNG's texts that may state an orientation
+_EXIF_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")  # PNG text chunks that may have an orientation
 _BROKEN = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 _BROKEN_EXIF = (*_BROKEN, KeyError, TypeError, struct.error, OverflowError)  # the pixels may be fine
 
 
 def image_digest(path: Path, *, photograph: bool = True) -> str:
-    """Digest of an image as it is read: of its file, and of the rules that only some files need.
+    """Digest of an image as it is read: of the file, and of any special rules applied to it.
 
-    ``photograph``: whether ``read_rgb`` reads it. Rules belong into ``_special_rules``, so that other files keep their
-    keys; those of masks are in the version of the detectors.
+    ``photograph``: whether ``read_rgb`` reads it. Put new rules into ``_special_rules``, so that files without them
+    keep their keys. Rules for masks are covered by the version of the detectors instead.
     """
     content = file_digest(path)
     try:
@@ -94,7 +94,7 @@ def image_digest(path: Path, *, photograph: bool = True) -> str:
 
 
 def _special_rules(image: PIL.Image.Image, *, photograph: bool) -> list[str]:
-    """What is done to this image that is not done to a plain one. Raise the number of a rule when it changes."""
+    """Rules that apply to this image but not to a plain one. Raise the number of a rule when you change it."""
     orientation = _read_orientation(image)
     rules = [] if orientation == 1 else [f"EXIF orientation {orientation}"]
     is_deep_grey = photograph and image.mode[0] in "IF"
@@ -139,7 +139,7 @@ def _open_header(path: Path) -> PIL.Image.Image:
 
 
 def _require_readable_size(image: PIL.Image.Image, path: Path) -> PIL.Image.Image:
-    """An image whose pixels fit in memory: its header says how many there are."""
+    """The image. Raises BadInput if the size in its header would not fit in memory."""
     check_megapixels(image.width, image.height, path)
     return image
 
@@ -168,7 +168,7 @@ def _read_orientation(image: PIL.Image.Image) -> int:
 
 
 def _has_exif(image: PIL.ImageFile.ImageFile) -> bool:
-    """Whether a PNG, of which only the header was read, has EXIF anywhere: PIL would decode all pixels to find out."""
+    """Whether a PNG has EXIF data anywhere. Scans the chunks, because PIL would decode all pixels to find out."""
     stream = image.fp
     if stream is None:
         return "exif" in image.info

@@ -24,8 +24,8 @@ _MAX_RATIO, _MAX_BYTES = 100, 1 << 26
 def read_json(path: Path) -> Any:
     """Contents of a ``.json`` or ``.json.gz`` file, UTF-8 with or without a byte order mark.
 
-    Raises BadInput, with line and column for a syntax error; also for a name that occurs twice in an object, since
-    json would drop one of the values.
+    Raises BadInput: for a syntax error with line and column; also for a duplicate name in an object, where Python's
+    json would silently keep the last value.
     """
     try:
         data = read_file(path, "a JSON file")

@@ -1,4 +1,4 @@
-"""Where a dataset's folders are, and what lies there instead: archives, folders too deep or too high, other sensors."""
+"""Folders of a dataset, with hints for common mistakes: archives, a root too deep or too high, another sensor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SENSOR = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 def check_folders(root: Path, split: str, models: str) -> None:
-    """Raise BadInput for a missing folder: with the folder that is meant, or with what is there."""
+    """Raise BadInput for a missing folder, suggesting the folder probably meant or listing what exists."""
     if root.is_file():
         raise BadInput(root, found=_describe_file(root), needed="the folder of the dataset (unpack an archive first)")
     if not root.is_dir():
@@ -41,7 +41,7 @@ def check_folders(root: Path, split: str, models: str) -> None:
 
 
 def check_scene_folder(folder: Path, scene_id: int, sensor: str = "") -> None:
-    """Raise BadInput for a missing scene, and for one without files of the chosen sensor; lists the sensors there."""
+    """Raise BadInput for a missing scene, or one without files of the chosen sensor; lists the sensors it has."""
     where = describe_place(folder, scene=scene_id)
     if not folder.is_dir():
         there = [p.name for p in _list_folders(folder.parent)] + _list_archives(folder.parent)
@@ -57,7 +57,7 @@ def check_scene_folder(folder: Path, scene_id: int, sensor: str = "") -> None:
 
 
 def check_sensor_name(sensor: str | None) -> str:
-    """The sensor's name, "" for None. Raises BadInput for one that is not part of a file name."""
+    """The sensor's name, "" for None. Raises BadInput for a name that no file can have."""
     if sensor is not None and not _SENSOR.fullmatch(sensor):
         raise BadInput("dataset.sensor", found=repr(sensor), needed="a sensor's name, such as cam1 or photoneo")
     return sensor or ""

@@ -1,4 +1,4 @@
-"""Lens distortion as users and camera files state it: checked coefficients, or what a camera's record says."""
+"""Lens distortion: coefficients from users, checked, and warnings about those in camera files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.distortion import COUNTS, UNDISTORTION_VERSION, folds, undistort, undistort_box
 
 _NEEDED = "[k1,k2,p1,p2], [k1,k2,p1,p2,k3] or [k1,k2,p1,p2,k3,k4,k5,k6] of OpenCV's pinhole model"
-_MAX_TANGENTIAL = 0.02  # of p1 and p2: real lenses stay an order of magnitude below
+_MAX_TANGENTIAL = 0.02  # limit of p1 and p2: real lenses are an order of magnitude below
 _FISHEYE_NAMES = ("fisheye", "equidistant", "kannala", "omni")
 
 Box = tuple[float, float, float, float]
@@ -22,21 +22,21 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """The distortion of a photograph's lens, in OpenCV's order of coefficients; K stays the same without it."""
+    """The distortion of a photograph's lens, in OpenCV's order of coefficients. Undistorting keeps K."""
 
     K: Float[np.ndarray, "3 3"]
     coefficients: tuple[float, ...]
 
     def identity(self) -> list[Any]:
-        """What pixels depend on, for keys."""
+        """Part of cache keys: all that undistorted pixels depend on."""
         return ["undistorted", UNDISTORTION_VERSION, self.K.tolist(), list(self.coefficients)]
 
     def undistort(self, image: Shaped[np.ndarray, "H W *c"]) -> Shaped[np.ndarray, "H W *c"]:
-        """An image, or a mask (nearest pixel), as a camera without distortion sees it."""
+        """An undistorted image, or mask (nearest neighbour)."""
         return undistort(image, self.K, self.coefficients, nearest=image.dtype == bool)
 
     def undistort_box(self, bbox_xyxy: Box, where: str) -> Box:
-        """The box around a box of the photograph. Raises BadInput where the coefficients have no inverse."""
+        """The bounding box of an undistorted box. Raises BadInput where the distortion cannot be inverted."""
         try:
             return undistort_box(bbox_xyxy, self.K, self.coefficients)
         except ValueError:
@@ -74,9 +74,9 @@ def parse_lens(given: Any, K: Float[np.ndarray, "3 3"], size_hw: tuple[int, int]
 
 
 def describe_distortion(record: Mapping[str, Any]) -> str:
-    """What a camera's record says of distortion that nothing here applies, and what to do; "" for none.
+    """Warning that a camera record's distortion is not applied, with what to do; "" without distortion.
 
-    Coefficients may have any name with "dist" in it, as a list or by name, or be fields k1, k2, ... of the record.
+    Recognises any field with "dist" in its name, a list or a mapping, and fields k1, k2, ... of the record.
     """
     stated = [value for name, value in record.items() if "dist" in name.lower() and isinstance(value, list | dict)]
     values = list(stated[0].values()) if stated and isinstance(stated[0], dict) else stated[0] if stated else []

@@ -15,12 +15,12 @@ from pipeline.bop.results import COLUMNS, ResultRow, parse_results_name, scan_re
 ORTHONORMAL = 1e-3
 """Largest entry of |R R^T - I| without a warning (three decimals exceed it); above ROTATION_TOLERANCE it is a fault."""
 _MAX_DISTANCE_MM = 1e6
-_MIN_DISTANCE_MM = 20.0  # a smaller median distance must be in metres: no camera sees an object 2 cm away
+_MIN_DISTANCE_MM = 20.0  # a smaller median distance is in metres: no camera sees an object 2 cm away
 
 
 @dataclass(frozen=True)
 class LintReport:
-    """Findings: ``faults`` make a submission invalid or wrong; ``warnings`` may be intended."""
+    """``faults`` make a submission invalid or wrong; ``warnings`` may be intended."""
 
     rows: int
     faults: tuple[str, ...]
@@ -52,7 +52,7 @@ def lint(path: Path, data: Dataset | None) -> LintReport:
 
 
 def _check_units(path: Path, rows: Sequence[ResultRow]) -> list[str]:
-    """Faults: translations in other units than mm."""
+    """Faults: translations that are not in mm."""
     largest = max(float(np.abs(row.T_cam_obj[:3, 3]).max()) for row in rows)
     if largest > _MAX_DISTANCE_MM:
         return [f"{path}, field t: found {largest:.3g}, needs millimetres: no camera sees an object that far away"]

@@ -39,7 +39,7 @@ def draw_polygons(polygons: list[Any], size_hw: tuple[int, int]) -> dict[str, An
     """The union of COCO's polygons, as ``encode_rle`` returns it.
 
     Each polygon is a list [x, y, x, y, ...] in pixels. A single polygon may be such a list itself, or a list of points
-    [[x, y], ...]. Raises ValueError for anything else, and for corners that are parts of the image's size.
+    [[x, y], ...]. Raises ValueError for anything else, and for corners given as fractions of the image size.
     """
     arrays = _parse_polygons(polygons, size_hw)
     if all(((array >= 0) & (array <= 1)).all() for array in arrays):
@@ -72,7 +72,7 @@ def _parse_polygon(polygon: Any, size_hw: tuple[int, int]) -> np.ndarray:
     if len(polygon) < 6 or len(polygon) % 2:
         raise ValueError(f"polygon has {len(polygon)} numbers, not x and y of three or more corners")
     array, longer = np.array(polygon, dtype=np.float64), max(size_hw)
-    if not (np.abs(array) <= 2 * longer).all():  # also false for what is not finite
+    if not (np.abs(array) <= 2 * longer).all():  # also false for NaN and infinity
         raise ValueError(f"polygon has corners far outside the image of {size_hw[1]} x {size_hw[0]} (width x height)")
     return array
 

@@ -24,9 +24,9 @@ MAX_SYMMETRY_STEP = 0.01
 
 
 _UNITS = (("metres", 1000, 1.8), ("inches", 25.4, 1.1), ("centimetres", 10, 1.8), ("decimetres", 100, 1.8))
-"""Units that a mesh may have instead of mm: mm per unit, and how far a ratio of diameters may be off it.
+"""Units that a mesh may be in by mistake: mm per unit, and the tolerance of a ratio of diameters.
 
-A bounding box's diagonal, which some datasets state as diameter, is up to 1.73 times the diameter.
+Some datasets state the bounding box's diagonal, which is up to 1.73 times the diameter.
 """
 
 
@@ -73,9 +73,9 @@ def read_model(
 
 
 def compare_diameters(path: Path, facts: MeshFacts, info: ModelInfo) -> str:
-    """A warning if models_info.json states another diameter than the mesh has, "" if they agree.
+    """A warning if the diameter in models_info.json differs from the mesh's, "" if they agree.
 
-    Raises BadInput if the two look like different units of length.
+    Raises BadInput if they seem to be in different units.
     """
     stated, measured = info.diameter_mm, facts.diameter_mm
     if abs(measured - stated) <= 0.1 * stated:
@@ -126,7 +126,7 @@ def _discretise(axis: Float[np.ndarray, " 3"], offset: Float[np.ndarray, " 3"]) 
 
 
 def _describe_unit_fault(diameter: float, distances_mm: Sequence[float]) -> str:
-    """Why the mesh or its distances cannot be in mm, "" if they can."""
+    """Why the mesh or its distances cannot be in mm; "" if they may be."""
     if diameter < 1:
         return f"a diameter of {diameter:.3g} (it looks like metres)"
     if not distances_mm:

@@ -44,17 +44,17 @@ EXIF_WARNING = (
 
 @spec
 class PhotoConfig(Spec):
-    """Meshes, photographs, K, and where the object is: masks, a box, or neither if a detector is to find it.
+    """Meshes, photographs, K, and the object's location: masks, a box, or neither if a detector finds it.
 
     ``mesh``: one file, or several for a detector; they become objects 1, 2, ... in this order. ``image``: a file, a
     pattern such as shots/*.png, or several files; photographs of one camera and size. ``K``: fx, fy, cx, cy, the nine
     numbers of the matrix row by row, a camera file, or "exif". ``mask``: a file, a pattern or several; with several
-    photographs, masks belong to the photograph whose name theirs begins with, several to several instances.
-    ``mask_label``: the object's value, or those of its instances, in a mask that labels several. ``bbox``: x, y, width,
-    height in pixels. ``scale`` multiplies the mesh's vertices, whose unit is ``units``. ``distortion``: k1, k2, p1,
-    p2[, k3[, k4, k5, k6]] of OpenCV's model; photographs, masks and the box are undistorted before anything else.
-    ``simplify``: most faces of a mesh, None for all. ``depth``: depth image of the photograph's size, ``depth_scale``
-    mm per unit.
+    photographs, a mask's name begins with that of its photograph. Each mask of a photograph is one instance.
+    ``mask_label``: the value of the object, or values of its instances, in a mask of several labels. ``bbox``: x, y,
+    width, height in pixels. ``scale`` multiplies the mesh's vertices, whose unit is ``units``. ``distortion``: k1, k2,
+    p1, p2[, k3[, k4, k5, k6]] of OpenCV's model; photographs, masks and the box are undistorted before anything else.
+    ``simplify``: maximum number of faces of a mesh, None for all. ``depth``: depth image of the photograph's size;
+    ``depth_scale``: mm per unit.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -115,7 +115,7 @@ class PhotoConfig(Spec):
         )
 
     def _camera(self, photo: Path, size_hw: tuple[int, int]) -> CameraFile:
-        """K with whatever else the camera's file states. Raises BadInput."""
+        """K, with distortion and image size if the camera file has them. Raises BadInput."""
         given = self.K
         if isinstance(given, str) and (numbers := numbers_in(given)) is not None:
             given = tuple(numbers)
@@ -148,7 +148,7 @@ class PhotoConfig(Spec):
         return ((), None) if self.mask is None else (_pair_masks(find_files(self.mask, "dataset.mask"), photos), None)
 
     def _check_depth(self, path: Path, photos: int, size_hw: tuple[int, int]) -> None:
-        """Raise BadInput for a depth image of another size, and for one of a photograph with distortion."""
+        """Raise BadInput for a depth image of another size, and for depth together with ``distortion``."""
         if photos > 1:
             raise BadInput("dataset.depth", found=f"one depth image for {photos} photographs", needed="one photograph")
         (h, w), found = size_hw, image_size(path)
@@ -160,7 +160,7 @@ class PhotoConfig(Spec):
 
 
 def find_files(given: str | tuple[str, ...], where: str) -> tuple[Path, ...]:
-    """Files of a name, of a pattern with * or ?, or of several of both, sorted by name. Raises BadInput for none."""
+    """Files with this name or matching this pattern (* or ?), or several of these, sorted. Raises BadInput for none."""
     found: list[Path] = []
     for name in (given,) if isinstance(given, str) else given:
         path = Path(name).expanduser()
@@ -178,7 +178,7 @@ def find_files(given: str | tuple[str, ...], where: str) -> tuple[Path, ...]:
 
 
 def _common_size(photos: tuple[Path, ...]) -> tuple[int, int]:
-    """(h, w) of the photographs. Raises BadInput for two sizes, which no K fits."""
+    """(h, w) of the photographs. Raises BadInput if they differ: one K cannot fit two sizes."""
     sizes = {path: image_size(path) for path in photos}
     first = sizes[photos[0]]
     for path, size_hw in sizes.items():
@@ -246,17 +246,17 @@ class Photo(GivenObjects):
 
     @property
     def given_location(self) -> list[Any]:
-        """Label of the mask and lens, where they are given."""
+        """Label of the mask, and lens, if given."""
         given: list[Any] = [] if self.mask_label is None else [self.mask_label]
         return given if self.lens is None else [*given, self.lens.identity()]
 
     @property
     def image_note(self) -> str:
-        """That pictures show the photograph without distortion."""
+        """States that figures show the undistorted photograph, if they do."""
         return "" if self.lens is None else "undistorted photograph"
 
     def image(self, scene_id: int, im_id: int) -> Image:
-        """The photograph, without the lens's distortion if that is given."""
+        """The photograph, undistorted if the lens is known."""
         rgb = read_rgb(self.photos[im_id])
         return Image(scene_id, im_id, rgb if self.lens is None else self.lens.undistort(rgb), self.camera_matrix)
 
@@ -268,7 +268,7 @@ class Photo(GivenObjects):
     def object_mask(
         self, path: Path, size_hw: tuple[int, int], *, im_id: int = 0, label: int | None = None
     ) -> Bool[np.ndarray, "H W"]:
-        """The mask in a file, without the lens's distortion if that is given. Raises BadInput for another size."""
+        """The mask in a file, undistorted if the lens is known. Raises BadInput for another size."""
         mask, (h, w) = read_mask(path, label=label), size_hw
         if mask.shape != size_hw:
             turned = mask.shape == (w, h) and read_orientation(self.photos[im_id]) in QUARTER_TURNS
@@ -295,7 +295,7 @@ class Photo(GivenObjects):
         return [*self.photos, *(mask for masks in self.masks for mask in masks)]
 
     def locate(self, target: Target) -> list[Detection]:
-        """Detections of the masks or the box. Raises BadInput for what does not fit the photograph, and for none."""
+        """Detections from the masks or the box. Raises BadInput if there are none, or if one does not fit."""
         if not self.masks and self.bbox_xyxy is None:
             needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=cnos, which finds the object"
             raise BadInput("dataset", found="neither of mask and bbox", needed=needed)

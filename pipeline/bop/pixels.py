@@ -1,4 +1,4 @@
-"""Pixel values as files store them -> 8-bit intensities, or the pixels of one object. The rules are stated here."""
+"""Stored pixel values -> 8-bit intensities, or the mask of one object. All rules for both are in this module."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ MAX_MEGAPIXELS = 300
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 DEEP_GREY_VERSION = 2
 """Version of ``scale_to_8_bits``; in version 1 white was 65535. ``select_object`` counts as part of the detectors."""
-NEAR = 0.03  # of the largest value: how far compression moves a flat region from black or white
+NEAR = 0.03  # share of the largest value: compression shifts flat black or white by less
 SMALLEST_WHITE = 128  # integers below it are labels, not intensities
-_JUMP = 0.1  # of the largest value: a soft edge rises less from one pixel to the next
-COLOUR_NEAR = 0.4  # of the largest value: how far compression moves the colour of a mask
+_JUMP = 0.1  # share of the largest value: a soft edge rises less from one pixel to the next
+COLOUR_NEAR = 0.4  # share of the largest value: compression shifts the colour of a mask by less
 MAX_LABELS_SHOWN = 8
 
 
@@ -77,7 +77,7 @@ def select_object(
 
 
 def _is_photograph(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
-    """Whether most pixels that are not black are not white either, and no soft edge explains it.
+    """Whether most non-black pixels are grey, and not because of soft edges.
 
     A soft edge rises gradually from black; a photograph cut out on black begins with its own shades, and a whole one
     has hardly any black.
@@ -91,7 +91,7 @@ def _is_photograph(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
 
 
 def _has_plateau(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
-    """Whether a region between black and white is flat, as labels are and soft edges are not."""
+    """Whether there is a flat grey region: labels have them, soft edges do not."""
     values = grey.astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     flat = cv2.erode(values, square) == cv2.dilate(values, square)
@@ -99,7 +99,7 @@ def _has_plateau(grey: Shaped[np.ndarray, "H W"], largest: float) -> bool:
 
 
 def _one_colour(values: Shaped[np.ndarray, "H W *c"], inside: Bool[np.ndarray, "H W"]) -> bool:
-    """Whether most pixels inside have nearly one colour."""
+    """Whether most pixels inside have nearly the same colour."""
     if values.ndim == 2 or not inside.any():
         return True
     colours = values[inside].astype(np.float64)

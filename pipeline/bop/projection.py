@@ -1,4 +1,4 @@
-"""K, boxes and poses of an image -> whether they belong together: a check that K is not of another image size."""
+"""Check that projected poses land on their annotated boxes: they do not if K belongs to another image size."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ class ResultRow:
 def results_name(method: str, dataset: str, split: str = "test") -> str:
     """BOP's file name, ``<method>_<dataset>-<split>.csv``, without the split's sensor ("test_primesense" -> "test").
 
-    Raises BadInput for names with an underscore, where BOP's tools split the file name, and with characters that a
-    file system, a shell or a spreadsheet gives a meaning to.
+    Raises BadInput for names with an underscore, at which BOP's tools split the file name, and with characters that
+    are special to a file system, shell or spreadsheet.
     """
     for field, name, others in (("method", method, ""), ("dataset.name", dataset, ""), ("dataset.split", split, "_")):
         if not re.fullmatch(rf"[A-Za-z0-9][A-Za-z0-9.{others}-]{{0,{_NAME_LENGTH - 1}}}", name):

@@ -29,7 +29,7 @@ Box = tuple[float, float, float, float]
 class Camera:
     """An image's camera matrix, px. ``depth_scale``: mm per unit of the depth image, None if unknown.
 
-    ``distortion``: what is stated of it beside K, "" for nothing; images are taken as undistorted.
+    ``distortion``: warning about distortion stated next to K, "" for none; images are assumed to be undistorted.
     """
 
     K: Float[np.ndarray, "3 3"]
@@ -57,7 +57,7 @@ class GroundTruth:
 class Scene:
     """A folder ``<root>/<split>/<scene_id>``. Its JSON files are read once, when first needed.
 
-    ``sensor``: in a scene that several sensors saw, the one whose files are read: scene_camera_cam1.json, rgb_cam1/.
+    ``sensor``: which sensor's files to read in a scene of several: scene_camera_cam1.json, rgb_cam1/.
     """
 
     folder: Path
@@ -65,7 +65,7 @@ class Scene:
     sensor: str = ""
 
     def path(self, name: str) -> Path:
-        """A file or folder by its name in BOP's format, such as scene_gt.json or mask; that of the sensor."""
+        """A file or folder by its BOP name, such as scene_gt.json or mask, with the sensor's suffix if there is one."""
         stem, dot, suffix = name.partition(".")
         return self.folder / (f"{stem}_{self.sensor}{dot}{suffix}" if self.sensor else name)
 
@@ -121,7 +121,7 @@ class Scene:
 
     @cached_property
     def _ground_truth(self) -> dict[int, list[GroundTruth]]:
-        """Parsed instances by image, since every step needs them. A plain dict, so that workers can unpickle it."""
+        """Cache of parsed instances by image, which every step needs. A plain dict, so that workers can unpickle it."""
         return {}
 
     def _parse_ground_truth(self, im_id: int) -> list[GroundTruth]:
@@ -164,7 +164,7 @@ def xyxy_from_xywh(bbox_xywh: Sequence[float]) -> Box:
 
 
 def describe_rotation_fault(R: Float[np.ndarray, "3 3"]) -> str:
-    """Why R is not a rotation within ROTATION_TOLERANCE, "" if it is."""
+    """Why R is not a rotation within ROTATION_TOLERANCE; "" if it is one."""
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE:
         return f"a matrix whose R R^T differs from the identity by {error:.3g}"
