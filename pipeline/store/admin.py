@@ -17,12 +17,12 @@ from pipeline.store.store import Store
 from pipeline.store.writing import MARKER
 
 COMPLETE, INCOMPLETE, NEWER, FOREIGN = "complete", "incomplete", "newer", "foreign"
-"""States of an entry. Newer: of a newer format. Foreign: a folder named like an entry, but without our marker."""
+"""States of an entry. Newer: written in a newer format. Foreign: a folder named like an entry, without our marker."""
 
 
 @dataclass(frozen=True)
 class EntryInfo:
-    """One entry as ``dzop cache ls`` lists it. ``age_h``: hours since it was completed, None if it never was.
+    """One entry as ``dzop cache ls`` lists it. ``age_h``: hours since completion, None if incomplete.
 
     ``made_by``: the process that completed it (``pipeline.machine``), empty for older entries.
     """
@@ -38,7 +38,7 @@ class EntryInfo:
 
     @property
     def complete(self) -> bool:
-        """Whether it is complete and in a format that this version reads."""
+        """Whether it is complete and readable by this version."""
         return self.state == COMPLETE
 
     @property
@@ -91,20 +91,20 @@ def _read_state(store: Store, path: str) -> tuple[str, Mapping[str, Any], Mappin
 
 def _hours_since(time: str) -> float:
     seconds = (datetime.now(UTC) - datetime.fromisoformat(time)).total_seconds()
-    return max(0.0, seconds / 3600)  # the clock may have been set back since
+    return max(0.0, seconds / 3600)  # the clock may have been set back in the meantime
 
 
 def verify(store: Store) -> dict[str, str]:
     """Read every byte of every entry: path -> problem, "" for an intact entry.
 
-    A damaged entry is marked incomplete, so that the next run repairs it. Folders that are not entries are left out,
-    and entries of a newer format, which is announced.
+    A damaged entry is marked incomplete, so that the next run repairs it. Skips entries of a newer format, with a
+    message, and folders that are not entries.
     """
     return {entry.path: _find_problem(store, entry) for entry in _own_entries(store, "not verified")}
 
 
 def _own_entries(store: Store, consequence: str) -> list[EntryInfo]:
-    """Entries that this version may read and remove; announces the others."""
+    """Entries that this version may read and remove; prints a message for each of the others."""
     reasons = {NEWER: "is of a newer format; update dzop", FOREIGN: "has no marker of dzop, so it is not an entry"}
     entries = list_entries(store)
     for entry in entries:
@@ -129,9 +129,9 @@ def _find_problem(store: Store, info: EntryInfo) -> str:
 def collect_garbage(store: Store, *, older_than_h: float | None, dry_run: bool) -> list[EntryInfo]:
     """Remove incomplete entries, and complete ones older than ``older_than_h`` if given; returns them.
 
-    ``dry_run`` removes nothing. Entries that a running process uses are kept, which is announced, and so are folders
-    without our marker and entries of a newer format. Where the store has locks, an entry that is being written is
-    waited for and kept.
+    ``dry_run`` removes nothing. Entries in use by a running process, folders without our marker and entries of a newer
+    format are kept, with a message. Where the store has locks, this waits for an entry that is being written and
+    keeps it.
     """
     leases = live_leases(store.backend.zarr)
     garbage = []
@@ -151,12 +151,12 @@ def collect_garbage(store: Store, *, older_than_h: float | None, dry_run: bool) 
 
 
 def _remove(store: Store, entry: EntryInfo) -> bool:
-    """Remove an entry unless it was completed, or a process began to use it, since it was listed."""
+    """Remove an entry unless it was completed or leased since it was listed."""
     with store.backend.lock(entry.key, store.announce):
         keys, (state, before, _) = list_keys(store.backend.zarr, entry.path), _read_state(store, entry.path)
         if state != entry.state:
             return False
-        withdraw(store.backend, entry.path)  # whoever takes a lease from now on finds no complete entry
+        withdraw(store.backend, entry.path)  # from now on, a process that takes a lease finds no complete entry
         if entry.key in live_leases(store.backend.zarr):
             if before:
                 write_attributes(store.backend.zarr, entry.path, before)
@@ -164,13 +164,13 @@ def _remove(store: Store, entry: EntryInfo) -> bool:
             return False
         if store.backend.has_locks:
             store.delete(entry.path)
-        else:  # only what was there before we looked for leases: a writer may have started since
+        else:  # only keys from before we looked for leases: a writer may have started since
             delete_keys(store.backend.zarr, keys)
         return True
 
 
 def _remove_leftovers(store: Store, entry: EntryInfo) -> None:
-    """Remove what other writers left in a complete entry: folders that its record does not name, and journals."""
+    """Remove leftovers of other writers from a complete entry: folders that its record does not name, and journals."""
     with store.backend.lock(entry.key, store.announce):
         keys, attributes = list_keys(store.backend.zarr, entry.path), store.attributes(entry.path) or {}
         record = completion_record(attributes, entry.key)
@@ -196,9 +196,9 @@ def find_entry(store: Store, prefix: str) -> EntryInfo:
 
 
 def check_is_store(store: Store) -> None:
-    """Raise DzopError for a folder or bucket that holds other things than a store.
+    """Raise DzopError for a folder or bucket that is neither a store nor empty.
 
-    A store has our marker in its root; one that only older versions wrote has locks, or entries. What is empty passes.
+    A store has our marker in its root, or locks or entries if only older versions wrote to it.
     """
     zarr = store.backend.zarr
     if read_bytes(zarr, MARKER) is not None or (store.backend.folder and (store.backend.folder / ".locks").is_dir()):

@@ -1,6 +1,6 @@
 """Zarr groups and arrays as the store uses them: one checksummed chunk per row.
 
-Every function takes the Zarr store or group that it works on; none of them knows about locks or completion records.
+Functions take the Zarr store or group to work on. Locks and completion records are handled elsewhere.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from zarr.storage import MemoryStore
 from pipeline.store.completion import metadata_digest
 
 READ_ERRORS = (BaseZarrError, ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError, IsADirectoryError)
-"""What Zarr and its codecs raise for missing or damaged data."""
+"""Exceptions that Zarr and its codecs raise for missing or damaged data."""
 
 _WRITE_ZEROS: Any = {"write_empty_chunks": True}
 
@@ -43,7 +43,7 @@ class Layout:
 
 
 def read_bytes(store: ZarrStore, key: str) -> bytes | None:
-    """Value of a key, None when there is no such key."""
+    """Value of a key, None if it does not exist."""
     value = sync(store.get(key, default_buffer_prototype()))
     return None if value is None else value.to_bytes()
 
@@ -54,7 +54,7 @@ def write_bytes(store: ZarrStore, key: str, value: bytes) -> None:
 
 
 def read_attributes(store: ZarrStore, paths: Sequence[str]) -> list[dict[str, Any] | None]:
-    """Attributes of groups, read at once; None for a group that is missing or whose metadata cannot be read."""
+    """Attributes of groups, read concurrently; None for a group that is missing or has unreadable metadata."""
 
     async def read_all() -> list[Any]:
         prototype = default_buffer_prototype()
@@ -80,7 +80,7 @@ def _parse_attributes(text: bytes) -> dict[str, Any] | None:
 
 
 def open_array(store: ZarrStore, path: str) -> zarr.Array | None:
-    """The array at ``path``, None when it is missing or its metadata cannot be read."""
+    """The array at ``path``, None if it is missing or its metadata is unreadable."""
     try:
         found = zarr.open_array(store, path=path, mode="r+", zarr_format=3)
     except READ_ERRORS:
@@ -90,9 +90,9 @@ def open_array(store: ZarrStore, path: str) -> zarr.Array | None:
 
 
 def create_array(store: ZarrStore, path: str, layout: Layout, rows: int) -> zarr.Array:
-    """A new array of ``rows`` rows; one request, and equal bytes whoever creates it.
+    """A new array of ``rows`` rows. Takes one request and writes the same bytes in every process.
 
-    The metadata that Zarr would also write for every group above it is left to the entry's group.
+    Unlike Zarr, does not write metadata for the groups above: the entry's group has been created before.
     """
     write_bytes(store, f"{path}/zarr.json", _array_metadata(layout, rows)[0])
     return zarr.open_array(store, path=path, mode="r+", zarr_format=3).with_config(_WRITE_ZEROS)
@@ -135,7 +135,7 @@ def list_keys(store: ZarrStore, prefix: str) -> list[str]:
 
 
 def delete_keys(store: ZarrStore, keys: Sequence[str]) -> None:
-    """Remove keys, several at once; what is missing already is no error."""
+    """Remove keys concurrently; missing ones are no error."""
 
     async def delete_all() -> None:
         await asyncio.gather(*(store.delete(key) for key in keys))
@@ -144,7 +144,7 @@ def delete_keys(store: ZarrStore, keys: Sequence[str]) -> None:
 
 
 def stored_bytes(store: ZarrStore, prefix: str) -> int:
-    """Bytes that the keys below ``prefix`` take where they are stored."""
+    """Stored bytes of the keys below ``prefix``."""
     return sync(store.getsize_prefix(f"{prefix}/"))
 
 

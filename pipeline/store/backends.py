@@ -32,10 +32,10 @@ Announce = Callable[[str], None]
 class Backend:
     """An open backend.
 
-    ``place``: its location, for messages. ``folder``: its folder on disk, None when it is not on this machine.
+    ``place``: its location, for messages. ``folder``: its folder on the local disk, else None.
     ``lock(name, announce)``: a context manager; ``announce`` is called with a message if it has to wait.
-    ``has_locks``: whether ``lock`` keeps other writers out; without, each writer of an entry has a folder of its own.
-    ``is_shared``: whether other processes reach the store.
+    ``has_locks``: whether ``lock`` excludes other writers; if not, each writer of an entry has a folder of its own.
+    ``is_shared``: whether other processes can access the store.
     """
 
     zarr: ZarrStore
@@ -56,7 +56,7 @@ class StoreConfig(Protocol):
 
 @spec
 class LocalStoreConfig(Spec):
-    """A folder. When two processes need the same entry, one computes it; the other waits, then reads it."""
+    """A folder. If two processes need the same entry, one computes it while the other waits and then reads it."""
 
     kind: ClassVar[str] = "store.local"
     root: str = "cache"
@@ -77,9 +77,9 @@ class LocalStoreConfig(Spec):
 
 
 class _LocalStore(LocalStore):
-    """LocalStore without needless writes: creating a group makes Zarr set the metadata of every group above it.
+    """LocalStore that skips redundant writes: Zarr rewrites the metadata of all parent groups for each new group.
 
-    A file that cannot be read, for instance without permission or on a broken disk, raises DzopError.
+    An unreadable file (no permission, broken disk) raises DzopError.
     """
 
     async def get(
@@ -92,13 +92,13 @@ class _LocalStore(LocalStore):
             raise DzopError(f"{self.root / key}: cannot be read ({error.strerror})") from None
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        """See ZarrStore.list_prefix. Folders that another process removes meanwhile are no error."""
+        """See ZarrStore.list_prefix. Folders removed concurrently are no error."""
         for folder, _, names in os.walk(self.root / prefix):
             for name in names:
                 yield (Path(folder) / name).relative_to(self.root).as_posix()
 
     async def getsize_prefix(self, prefix: str) -> int:
-        """See ZarrStore.getsize_prefix. Files that another process removes meanwhile are no error."""
+        """See ZarrStore.getsize_prefix. Files removed concurrently are no error."""
         total = 0
         async for key in self.list_prefix(prefix):
             with suppress(FileNotFoundError):
@@ -106,7 +106,7 @@ class _LocalStore(LocalStore):
         return total
 
     async def delete_dir(self, prefix: str) -> None:
-        """See ZarrStore.delete_dir. What another process removes or adds meanwhile is no error."""
+        """See ZarrStore.delete_dir. Files removed or added concurrently are no error."""
         for folder, _, names in os.walk(self.root / prefix, topdown=False):
             for name in names:
                 (Path(folder) / name).unlink(missing_ok=True)
@@ -117,7 +117,7 @@ class _LocalStore(LocalStore):
                     raise
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """As LocalStore.set_if_not_exists, which writes a temporary file even when the key exists."""
+        """As LocalStore.set_if_not_exists, but without writing a temporary file if the key exists."""
         if not await self.exists(key):
             await super().set_if_not_exists(key, value)
 
@@ -148,7 +148,7 @@ def _explain_read_only(root: Path) -> Iterator[None]:
 
 @spec
 class MemoryStoreConfig(Spec):
-    """In memory: lost when the process ends. For tests and for a single image."""
+    """In memory, lost when the process ends: for tests and single images."""
 
     kind: ClassVar[str] = "store.memory"
 
@@ -168,9 +168,9 @@ class MemoryStoreConfig(Spec):
 class S3StoreConfig(Spec):
     """An S3-compatible bucket (``pip install --editable '.[s3]'``), so that several machines share one cache.
 
-    There are no locks: two workers that need the same entry both compute it, each into a folder of its own, and the
-    completion record names the folder that counts. ``timeout_s``: how long one request may take; it is sent up to six
-    times, with pauses, before the run fails.
+    There are no locks: two workers that need the same entry both compute it, each in its own folder, and the completion
+    record names the folder to use. ``timeout_s``: limit of one request, which is retried up to five times, with pauses,
+    before the run fails.
     """
 
     kind: ClassVar[str] = "store.s3"
@@ -183,14 +183,14 @@ class S3StoreConfig(Spec):
         """Open the bucket. Raises BadInput for a malformed URL, StoreUnreachable if the bucket cannot be listed."""
         if not self.url.startswith("s3://") or not self.url.removeprefix("s3://").strip("/"):
             raise BadInput("store.url", found=repr(self.url), needed="s3://bucket/prefix")
-        logging.getLogger("aiobotocore.credentials").setLevel(logging.WARNING)  # it logs where it found credentials
+        logging.getLogger("aiobotocore.credentials").setLevel(logging.WARNING)  # it logs where it finds credentials
         try:
             store = BucketStore.open_url(self.url.rstrip("/"), self._options())
         except ImportError:
             raise BadInput(
                 "store", found="s3fs, which is not installed", needed="pip install --editable '.[s3]'"
             ) from None
-        store.fs.retries = 2  # by s3fs, on top of the three attempts by botocore: six requests
+        store.fs.retries = 2  # s3fs's own, on top of botocore's three: six requests in all
         sync(_check_bucket(store, self.url))
         return Backend(RemoteStore(store, self.url), self.url, None, lambda key, announce: nullcontext())
 
@@ -205,7 +205,7 @@ class S3StoreConfig(Spec):
                 "retries": {"total_max_attempts": 3, "mode": "standard"},
             },
             "use_listings_cache": False,  # other workers write there too
-            "max_concurrency": 1,  # within one read: more would cost a request for the size before every read
+            "max_concurrency": 1,  # one request per read: with more, s3fs would first ask for the size
         }
 
 
@@ -215,5 +215,5 @@ async def _check_bucket(store: BucketStore, url: str) -> None:
     with translate_errors(url):
         try:
             await store.fs._call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, MaxKeys=1)
-        except ValueError as error:  # botocore: the endpoint is not a URL
+        except ValueError as error:  # from botocore, if the endpoint is not a URL
             raise BadInput("store.endpoint_url", found=error, needed="a URL, http://host:port") from None

@@ -1,7 +1,7 @@
-"""Keys of an S3 bucket, with as few requests as S3 allows.
+"""Keys of an S3 bucket, with as few requests as possible.
 
-s3fs looks for a folder when a listing is empty, lists twice before it deletes, and lists names alone. It also takes
-``*``, ``?`` and ``[`` in a path for a pattern, and says nothing about keys that it may not delete.
+s3fs itself makes an extra request for an empty listing and two before a deletion, and lists names without sizes. It
+also treats ``*``, ``?`` and ``[`` in paths as patterns and ignores keys that it has no permission to delete.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class BucketStore(FsspecStore):
 
     @property
     def _root(self) -> str:
-        """What every key in the bucket starts with: empty, or a path that ends with a slash."""
+        """Common start of all keys in the bucket: empty, or a path that ends with a slash."""
         root = self.path.partition("/")[2]
         return root and f"{root}/"
 
@@ -58,7 +58,7 @@ class BucketStore(FsspecStore):
         return {name.removeprefix(f"{self.path}/"): int(info["size"]) for name, info in found.items()}
 
     async def _delete(self, keys: Sequence[str]) -> None:
-        """Delete up to a thousand keys; what is missing already is no error. Raises PermissionError for a refusal."""
+        """Delete up to a thousand keys; missing ones are no error. Raises PermissionError if S3 refuses."""
         names = {"Objects": [{"Key": self._root + key} for key in keys], "Quiet": True}
         answer: dict[str, Any] = await self.fs._call_s3("delete_objects", Bucket=self._bucket, Delete=names)
         for error in answer.get("Errors", ()):

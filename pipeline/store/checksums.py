@@ -1,8 +1,8 @@
-"""Checksums of chunks, kept by array and row: noted when a chunk is written, compared when it is read.
+"""Checksums of chunks by array and row, recorded when a chunk is written and compared when it is read.
 
-A chunk ends with a crc32c of its own bytes, which cannot tell that it lies in the place of another row or entry. The
-completion record therefore lists the checksum of every row of every array (``chunks`` on disk, eight hex digits a
-row). Entries completed before there was such a list are read with the chunk's own crc32c alone.
+A chunk ends with a crc32c of its own bytes, which does not show that the chunk belongs to another row or entry. The
+completion record therefore lists the checksum of every row of every array (``chunks`` on disk, eight hex digits per
+row). Older entries without this list are only checked against the crc32c inside each chunk.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from zarr.abc.store import Store as ZarrStore
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
-CRC_BYTES = 4  # at the end of a chunk
+CRC_BYTES = 4  # size of the crc32c at the end of a chunk
 
 RowChecksums = Mapping[int, bytes]
 """row -> the four bytes that end its chunk"""
@@ -38,7 +38,7 @@ def chunk_key(array_path: str, ndim: int, row: int) -> str:
 
 
 def is_intact(chunk: bytes, checksum: bytes) -> bool:
-    """Whether a chunk ends with this checksum and its bytes pass it."""
+    """Whether a chunk ends with this checksum and its bytes match it."""
     own = int.from_bytes(checksum, "little")
     return chunk[-CRC_BYTES:] == checksum and google_crc32c.value(chunk[:-CRC_BYTES]) == own
 
@@ -48,7 +48,7 @@ def _last_bytes(value: Buffer) -> bytes:
 
 
 class ChunkRecorder(WrapperStore[ZarrStore]):
-    """Notes the checksum of every chunk that is written through it. ``written``: key -> the chunk's last four bytes."""
+    """Records the checksum of every chunk written through it. ``written``: key -> the chunk's last four bytes."""
 
     def __init__(self, store: ZarrStore, written: dict[str, bytes] | None = None) -> None:
         super().__init__(store)
@@ -64,9 +64,9 @@ class ChunkRecorder(WrapperStore[ZarrStore]):
 
 
 class ChunkChecker(WrapperStore[ZarrStore]):
-    """Reads the chunks of one array. A missing chunk, which Zarr would read as zeros, raises FileNotFoundError.
+    """Reads the chunks of one array. A missing chunk raises FileNotFoundError, where Zarr would return zeros.
 
-    A chunk with another checksum than ``checksums`` has for its row raises ValueError; None compares nothing.
+    A chunk whose checksum differs from that of its row in ``checksums`` raises ValueError; None skips this check.
     """
 
     def __init__(self, store: ZarrStore, array_path: str, checksums: RowChecksums | None) -> None:

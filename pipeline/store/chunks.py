@@ -1,7 +1,7 @@
 """Read and write rows on disk directly, which is several times faster than through Zarr.
 
-Zarr's codec pipeline takes half a millisecond per chunk and copies it three times, in a thread of its own. Here a chunk
-is one file that this thread reads or writes at once. The format on disk, to the byte, is that of Zarr.
+Zarr's codec pipeline takes half a millisecond per chunk and copies it three times, in a separate thread. Here, the
+calling thread reads or writes each chunk's file directly. The format on disk is Zarr's, byte for byte.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ChunkFiles:
 
     @classmethod
     def of(cls, folder: Path | None, array: zarr.Array) -> ChunkFiles | None:
-        """The chunks of an array below ``folder``; None where they are not on this disk, or of another format."""
+        """The chunks of an array below ``folder``; None if they are not on a local disk or in another format."""
         codecs: Any = array.metadata.to_dict().get("codecs", ())
         names = [codec["name"] for codec in codecs]
         one_chunk_per_row = array.chunks == (1, *array.shape[1:]) and bool(np.prod(array.shape))
@@ -46,9 +46,9 @@ class ChunkFiles:
         return cls(str(folder / array.path), array.shape[1:], array.dtype, compressor)
 
     def read(self, rows: Sequence[int], checksums: RowChecksums | None) -> np.ndarray:
-        """Values of rows. ``checksums`` None compares only a chunk's own.
+        """Values of rows. Without ``checksums``, only the crc32c inside each chunk is checked.
 
-        Raises OSError for a chunk that cannot be read; ValueError or RuntimeError for a wrong length, checksum or code.
+        Raises OSError for an unreadable chunk; ValueError or RuntimeError for a wrong length, checksum or compression.
         """
         values = np.empty((len(rows), *self.row), dtype=self.dtype)
         row_bytes = values.reshape(len(rows), -1).view(np.uint8)
@@ -59,7 +59,7 @@ class ChunkFiles:
         return values
 
     def write(self, rows: Sequence[int], values: np.ndarray) -> dict[int, bytes]:
-        """Write each row's chunk atomically; returns the checksums that end them. Raises OSError."""
+        """Write each row's chunk atomically; returns their checksums. Raises OSError."""
         block = np.ascontiguousarray(values, dtype=self.dtype)
         return {row: self._write_chunk(self._key(row), block[k]) for k, row in enumerate(rows)}
 
@@ -82,7 +82,7 @@ class ChunkFiles:
         return checksum
 
     def _write_chunk(self, path: str, row: np.ndarray) -> bytes:
-        """Write a chunk through a temporary sibling, named as Zarr names it; returns its checksum."""
+        """Write a chunk through a temporary sibling file, named as Zarr does; returns its checksum."""
         content = row.reshape(-1).view(np.uint8) if self.compressor is None else self.compressor.encode(row)
         checksum = int(google_crc32c.value(content)).to_bytes(CRC_BYTES, "little")
         os.makedirs(os.path.dirname(path), exist_ok=True)
@@ -115,7 +115,7 @@ def _read_raw_chunk(path: str, into: np.ndarray) -> bytes:
 
 
 def _write_all(file: int, parts: Sequence[Any]) -> None:
-    """Write buffers one after the other; a disk that is nearly full takes only a part before it raises OSError."""
+    """Write buffers one after the other. A nearly full disk writes only a part before it raises OSError."""
     for part in parts:
         left = memoryview(part).cast("B")
         while len(left):

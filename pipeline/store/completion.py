@@ -1,8 +1,8 @@
-"""Completion records: the attribute, written last, that turns a group of arrays into a usable entry.
+"""Completion records: an attribute, written last, that marks a group of arrays as a complete entry.
 
-The record holds digests of the document and of every array's metadata, the checksum of every chunk, the folder below
-the entry that holds the arrays, and a checksum (``seal`` on disk) over itself, the key and the recipe. An entry whose
-record is missing or inconsistent counts as incomplete.
+The record has digests of the document and of every array's metadata, the checksum of every chunk, the subfolder that
+holds the arrays, and a checksum (``seal`` on disk) of itself, the key and the recipe. An entry whose record is missing
+or inconsistent counts as incomplete.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FORMAT = 1
 
 
 class NewerEntry(DzopError):
-    """An entry was written by a newer version. It is neither read nor changed."""
+    """An entry was written by a newer version; it cannot be read and must not be changed."""
 
 
 def metadata_digest(array: zarr.Array) -> str:
@@ -32,7 +32,7 @@ def metadata_digest(array: zarr.Array) -> str:
 
 
 def identity(ref: Ref) -> dict[str, Any]:
-    """Attributes of an entry that is still being written: its key and what it is made from."""
+    """Attributes of an entry that is still being written: its key, recipe and inputs."""
     return {"format": FORMAT, "key": ref.key, "made_from": json.loads(ref.made_from)}
 
 
@@ -48,7 +48,7 @@ def complete_attributes(
     chunks: Mapping[str, str] | None = None,
     made_by: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Attributes of a complete entry: its identity, document and completion record. Write them last, in one request.
+    """Attributes of a complete entry: identity, document and completion record. Write them last, in one request.
 
     ``folder``: where its arrays are, relative to the entry. ``chunks``: array name -> checksums of its rows in hex.
     ``made_by``: the process that completes it, as ``machine.describe_machine`` gives it.
@@ -63,7 +63,7 @@ def complete_attributes(
         "folder": folder,
         "chunks": dict(chunks or {}),
         "made_by": dict(made_by or {}),
-        "writer": token_hex(8),  # so that no two records are equal
+        "writer": token_hex(8),  # makes every record unique
     }
     known = identity(ref)
     seal = _checksum(ref.key, known["made_from"], record)
@@ -71,7 +71,7 @@ def complete_attributes(
 
 
 def completion_record(attributes: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
-    """The completion record among an entry's attributes; None unless every digest and the checksum match."""
+    """The completion record in an entry's attributes; None unless all its digests and its checksum match."""
     record = intact_record(attributes, "complete", key)
     try:
         return record if record and digest(attributes["document"]) == record["document"] else None
@@ -98,10 +98,10 @@ def intact_record(attributes: Mapping[str, Any], name: str, key: str) -> Mapping
 
 
 def content_of(record: Mapping[str, Any]) -> Any:
-    """What two completion records of an entry have in common if two processes computed the same arrays.
+    """The part of a completion record that is equal if two processes computed the same arrays.
 
-    Entries of documents alone are read in one request, so any complete one is as good: seconds measured by different
-    processes differ. Before chunks were listed, only the record itself can be compared.
+    Entries without arrays are read in one request, so any complete one will do; their documents may differ in measured
+    seconds. Older records do not list chunks: these are compared as a whole.
     """
     if not record["arrays"]:
         return "document"
@@ -110,13 +110,13 @@ def content_of(record: Mapping[str, Any]) -> Any:
 
 
 def withdraw_record(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes without the completion record, which is kept as ``damaged``: intact rows can be told by it."""
+    """Attributes with the completion record moved to ``damaged``, where it still identifies intact rows."""
     left = {name: value for name, value in attributes.items() if name not in ("complete", "damaged")}
     return left | ({"damaged": attributes["complete"]} if "complete" in attributes else {})
 
 
 def is_ours(attributes: Mapping[str, Any], key: str) -> bool:
-    """Whether these are the attributes of the entry with this key, complete or not, in this format or a newer one."""
+    """Whether these are attributes of the entry with this key, complete or not, in this or a newer format."""
     known = isinstance(attributes.get("format"), int) and isinstance(attributes.get("made_from"), Mapping)
     return known and attributes.get("key") == key
 
@@ -129,7 +129,7 @@ def check_format(attributes: Mapping[str, Any], where: str) -> None:
 
 
 def is_newer(attributes: Mapping[str, Any]) -> bool:
-    """Whether an entry has a newer format than this version writes."""
+    """Whether an entry's format is newer than the one this version writes."""
     found = attributes.get("format")
     return isinstance(found, int) and not isinstance(found, bool) and found > FORMAT
 

@@ -1,4 +1,4 @@
-"""Reading: a complete entry and its arrays, checked against its completion record."""
+"""Read complete entries and their arrays, checked against the completion record."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipeline.store.remote import AccessDenied
 
 
 class DamagedEntry(DzopError):
-    """A complete entry turned out to be damaged. It has been marked incomplete, so the next run repairs it."""
+    """A complete entry is damaged. It has been marked incomplete, so the next run repairs it."""
 
 
 def mark_incomplete(backend: Backend, ref: Ref, reason: str, seal: str | None = None) -> DamagedEntry:
@@ -52,8 +52,8 @@ def withdraw(backend: Backend, path: str, seal: str | None = None) -> None:
 class Entry:
     """A complete entry, open for reading.
 
-    ``on_use`` is called with the record whenever something is read, and with None when it turns out to be damaged.
-    ``checked_arrays``: memo of arrays whose metadata has been checked.
+    ``on_use`` is called with the record on every read, and with None if damage is found. ``checked_arrays``: memo of
+    arrays whose metadata has been checked.
     """
 
     backend: Backend
@@ -67,7 +67,7 @@ class Entry:
 
     @property
     def rows(self) -> int:
-        """Number of rows: templates, detections or whatever the entry holds."""
+        """Number of rows, such as templates or detections."""
         return int(self.record["rows"])
 
     @property
@@ -89,7 +89,7 @@ class Entry:
     def array(self, name: str, rows: Iterable[int] | None = None) -> np.ndarray:
         """Values of all rows, or of the given ones in their order.
 
-        Raises DamagedEntry for a missing chunk, a chunk of another row or entry, a wrong checksum, changed metadata.
+        Raises DamagedEntry for a missing chunk, a chunk of another row or entry, a wrong checksum or changed metadata.
         """
         self.on_use(self.ref, self.record)
         array = self._check_array(name)
@@ -123,7 +123,7 @@ class Entry:
         return array
 
     def _checksums(self, name: str) -> RowChecksums | None:
-        """Checksums of an array's rows; None for an entry of a version that did not record them."""
+        """Checksums of an array's rows; None for entries of older versions, which did not record them."""
         chunks = self.record.get("chunks", {})
         if name in chunks and name not in self._parsed:
             self._parsed[name] = from_hex(chunks[name])

@@ -1,7 +1,7 @@
-"""Journal of an unfinished entry: which rows a writer has stored, and the checksums of their chunks.
+"""Journal of an unfinished entry: the rows each writer has stored, with the checksums of their chunks.
 
-A run that resumes the entry keeps a row only if one writer stored its chunks of all arrays, and these still have the
-checksums that this writer noted. The journal ends with the entry's completion, whose record has the same checksums.
+A run that resumes the entry keeps a row only if one writer stored its chunks in all arrays, and these still match that
+writer's checksums. The journal is removed on completion, when the completion record takes over the checksums.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from pipeline.store.completion import intact_record
 from pipeline.store.keys import Ref
 
 FOLDER = ".written"
-RUNNING_S = 120.0  # a writer that stored rows this short a while ago may still be running
+RUNNING_S = 120.0  # a writer that stored rows more recently may still be running
 
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Rows that one writer stored in a folder of the entry: checksums by array name and row."""
+    """Rows that one writer stored in its folder of the entry: checksums by array name and row."""
 
     folder: str
     checksums: Mapping[str, RowChecksums]
 
     @property
     def rows(self) -> set[int]:
-        """Rows with a chunk of every array."""
+        """Rows that have a chunk in every array."""
         return set.intersection(*(set(rows) for rows in self.checksums.values())) if self.checksums else set()
 
 
@@ -53,15 +53,15 @@ def note_rows(
 
 
 def note_end(store: ZarrStore, ref: Ref, writer: str, *, folder: str) -> None:
-    """Say that the writer ended early, so that its rows can be kept at once."""
+    """Record that the writer ended early, so that others may take over its rows without waiting."""
     note_rows(store, ref, writer, folder=folder, first=-1, arrays={}, chunks={})
 
 
 def read_journal(store: ZarrStore, ref: Ref, arrays: Mapping[str, str], *, has_locks: bool) -> list[StoredRows]:
-    """What writers stored of an entry whose arrays have this metadata; also what its withdrawn record lists.
+    """Rows stored by all writers of an entry whose arrays have this metadata, and those in its withdrawn record.
 
-    Without locks, rows of a writer that may still be running are left out, so that two writers of other bytes do not
-    end with an entry of both.
+    Without locks, rows of writers that may still be running are left out, so that no entry mixes rows of two writers
+    whose bytes differ.
     """
     found: list[StoredRows] = []
     (attributes,) = read_attributes(store, [ref.path])
@@ -83,7 +83,7 @@ def read_journal(store: ZarrStore, ref: Ref, arrays: Mapping[str, str], *, has_l
 
 
 def _running_writers(notes: Sequence[Mapping[str, Any]]) -> set[str]:
-    """Folders of writers that wrote to the journal a short while ago, and not that they ended."""
+    """Folders of writers that wrote to the journal recently and have not recorded their end."""
     recent = {note["folder"] for note in notes if abs(time.time() - note["at"]) < RUNNING_S}
     return recent - {note["folder"] for note in notes if note["first"] == -1}
 

@@ -11,7 +11,7 @@ from pipeline.spec import canonical, digest
 
 @dataclass(frozen=True)
 class Ref:
-    """Path of an entry, and the hashed text of what it is made from, which is stored with the entry."""
+    """Path of an entry, and the hashed text of its recipe and inputs, which is stored in the entry."""
 
     folder: str
     key: str

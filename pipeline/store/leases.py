@@ -1,11 +1,11 @@
-"""Leases: which entries running processes use, so that ``dzop cache gc`` of another process leaves them alone.
+"""Leases mark the entries that running processes use, so that ``dzop cache gc`` of another process keeps them.
 
-A process writes one empty key for each entry, ``.leases/<process>/<entry's key>``, before it looks whether the entry
-is complete; gc withdraws an entry's completion record before it looks for leases. Whatever the order, either gc finds
-the lease and restores the record, or the process finds no complete entry. This needs no locks, so it holds on S3 too.
+A process writes one empty key per entry, ``.leases/<process>/<entry's key>``, before it checks whether the entry is
+complete; gc withdraws an entry's completion record before it looks for leases. In any order, either gc finds the lease
+and restores the record, or the process finds no complete entry. This needs no locks, so it works on S3 too.
 
-A process that is killed leaves its leases behind. They end at once for a gc on the same machine, which finds that the
-process is gone, and elsewhere an hour after the process last used the store.
+A killed process leaves its leases behind. A gc on the same machine sees that the process is gone and ignores them;
+elsewhere they expire an hour after the process last used the store.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from pipeline.store.arrays import list_keys, read_bytes, write_bytes
 from pipeline.store.remote import AccessDenied, StoreUnreachable
 
 FOLDER = ".leases"
-LIFETIME_S = 3600.0  # since the process last used the store
+LIFETIME_S = 3600.0  # lifetime of a lease after the process last used the store
 _REFRESH_S = 60.0
-_CLOCK_SKEW_S = 86400.0  # a lease from the future is live up to here: clocks of machines differ
+_CLOCK_SKEW_S = 86400.0  # tolerance for leases from the future: clocks of machines differ
 _ALIVE = "alive"
 
 
 class Lease:
-    """The leases of one process. Where the store cannot be written there are none. May be used by several threads.
+    """The leases of one process; none on a read-only store. Thread-safe.
 
-    ``name``: that of the process which started this one, and which keeps and releases the leases of both.
+    ``name``: set in a worker to that of the parent process, which renews and releases the leases of both.
     """
 
     def __init__(self, store: ZarrStore, name: str = "") -> None:
@@ -53,16 +53,16 @@ class Lease:
         self._lock = threading.RLock()
 
     def take(self, key: str) -> None:
-        """Lease an entry. Call this before looking whether it is complete."""
+        """Lease an entry. Call this before checking whether it is complete."""
         self.refresh()
         with self._lock:
             if key not in self._taken and self._write(key, b""):
                 self._taken.add(key)
 
     def refresh(self) -> None:
-        """Say that this process is alive, at most once a minute.
+        """Renew the leases, at most once a minute.
 
-        By the clock on the wall: it goes on while a computer sleeps, after which gc may have removed the leases.
+        Uses wall-clock time, which goes on while a computer sleeps: gc may have removed the leases by then.
         """
         with self._lock:
             seconds = time.time() - self._refreshed_s
@@ -78,7 +78,7 @@ class Lease:
                     self._write(key, b"")
 
     def _process(self) -> Any:
-        """The process that releases the leases; None if it is another one, which has released them already."""
+        """Owner of the leases; None if a parent process owned them and has released them."""
         return _alive_record(self._store, self.name).get("process") if self._is_joined else _describe_process()
 
     def _write(self, name: str, content: bytes) -> bool:
@@ -92,14 +92,14 @@ class Lease:
         return True
 
     def release(self) -> None:
-        """Remove this process's leases and take none from now on. If the store does not answer, they expire."""
+        """Remove this process's leases and take no more. If the store does not answer, they expire."""
         with self._lock, suppress(OSError, StoreUnreachable):
             self._writable = False
             sync(self._store.delete_dir(f"{FOLDER}/{self.name}"))
 
 
 def live_leases(store: ZarrStore) -> dict[str, str]:
-    """Keys of entries that a process uses, each with the name of one such process (host, process id, random)."""
+    """Keys of leased entries, each with the name of one process that uses it (host, process id, random)."""
     names: dict[str, list[str]] = {}
     for key in list_keys(store, FOLDER):
         _, name, leased = (*key.split("/", 2), "", "")[:3]
@@ -109,7 +109,7 @@ def live_leases(store: ZarrStore) -> dict[str, str]:
 
 
 def remove_expired_leases(store: ZarrStore) -> None:
-    """Remove the leases of processes that ended without releasing them."""
+    """Remove expired leases, of processes that ended without releasing them."""
     for name in {key.split("/")[1] for key in list_keys(store, FOLDER)}:
         if not _is_live(store, name):
             sync(store.delete_dir(f"{FOLDER}/{name}"))
@@ -125,7 +125,7 @@ def _is_live(store: ZarrStore, name: str) -> bool:
 
 
 def _alive_record(store: ZarrStore, name: str) -> Mapping[str, Any]:
-    """What a process last said of itself; empty if there is nothing, or it was cut off by a full disk or power cut."""
+    """The record that a process last wrote of itself; empty if missing or cut off by a full disk or power failure."""
     try:
         found = json.loads(read_bytes(store, f"{FOLDER}/{name}/{_ALIVE}") or b"")
     except (ValueError, RecursionError):
@@ -137,33 +137,33 @@ def _alive_record(store: ZarrStore, name: str) -> Mapping[str, Any]:
 
 
 def _describe_process() -> dict[str, Any]:
-    """What tells this process from all others; of other systems than Linux, nothing that ``_has_ended`` could use."""
+    """Identifies this process among all others; on systems other than Linux without what ``_has_ended`` needs."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        namespace = os.readlink("/proc/self/ns/pid")  # process ids of two containers of one machine may be equal
+        namespace = os.readlink("/proc/self/ns/pid")  # two containers on one machine may have equal process ids
     except OSError:
         return {"pid": os.getpid()}
     return {"boot": boot, "namespace": namespace, "pid": os.getpid(), "started": _start_of(os.getpid())}
 
 
 def _has_ended(process: Any) -> bool:
-    """Whether a process ran on this machine and runs no more; False where this cannot be known."""
+    """Whether a process ran on this machine and has ended; False if unknown."""
     if not isinstance(process, Mapping) or not isinstance(pid := process.get("pid"), int) or not 0 < pid < 2**31:
         return False
     here = _describe_process()
     if "boot" not in here or any(process.get(name) != here[name] for name in ("boot", "namespace")):
         return False
     try:
-        os.kill(pid, 0)  # sends nothing
+        os.kill(pid, 0)  # only checks that the process exists
     except ProcessLookupError:
         return True
-    except PermissionError:  # another user's, whose start may be hidden
+    except PermissionError:  # another user's process, whose start time may be hidden
         pass
     return _start_of(pid) not in (None, process.get("started"))
 
 
 def _start_of(pid: int) -> int | None:
-    """When a process started, in clock ticks since the machine did; -1 if it has ended, None if it cannot be read."""
+    """Start time of a process in clock ticks since boot; -1 if it has ended, None if it cannot be read."""
     try:
         state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except (OSError, ValueError):

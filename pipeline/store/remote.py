@@ -20,7 +20,7 @@ _RESUME = "completed entries are kept"
 
 
 class StoreUnreachable(DzopError):
-    """A remote store did not answer or denied access. This says nothing about which entries it holds."""
+    """A remote store did not answer or denied access, so it is unknown which entries it holds."""
 
 
 class AccessDenied(StoreUnreachable):
@@ -31,7 +31,7 @@ class AccessDenied(StoreUnreachable):
 def translate_errors(place: str) -> Iterator[None]:
     """Raise StoreUnreachable, with a one-line message, for timeouts, refusals and lost connections.
 
-    A missing key stays FileNotFoundError (or what else Zarr expects), except when the whole bucket is missing.
+    A missing key stays FileNotFoundError (or whatever Zarr expects), unless the whole bucket is missing.
     """
     try:
         yield
@@ -49,7 +49,7 @@ def translate_errors(place: str) -> Iterator[None]:
 
 
 def _explain(error: Exception) -> str:
-    if type(error).__name__ == "NoCredentialsError":  # botocore's; importing it would need the s3 extra
+    if type(error).__name__ == "NoCredentialsError":  # an exception of botocore; importing it would need the s3 extra
         return "found no AWS credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or store.anonymous=true"
     reason = f"{type(error).__name__}: {_shorten(error)}"
     if isinstance(error, TimeoutError):

@@ -1,9 +1,9 @@
 """The feature store: entries of checksummed Zarr arrays and a JSON document, used only when complete.
 
-An entry is a Zarr group. Its attributes say what it is made from and, written last, that it is complete. Arrays have
+An entry is a Zarr group. Its attributes state its recipe and inputs and, written last, that it is complete. Arrays have
 one chunk per row (a template, a detection), each with a crc32c that the completion record lists: an interrupted run
-resumes chunk by chunk, and a flipped byte or a chunk of another row is detected when it is read. A missing chunk,
-which Zarr would read as zeros, is an error. Nothing is completed if an entry it was computed from changed meanwhile.
+resumes chunk by chunk, and a flipped byte or a chunk of another row is detected on reading. A missing chunk, which Zarr
+would read as zeros, is an error. An entry is not completed if one it was computed from has changed meanwhile.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pipeline.store.leases import Lease
 from pipeline.store.writing import MARKER, EntryWriter, lock_entries, open_or_create_group
 
 RowValues = Mapping[str, Mapping[str, np.ndarray]]
-"""key of an entry -> array name -> values of the requested rows"""
+"""Entry's key -> array name -> values of the requested rows."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class FillResult:
 
 
 class Store:
-    """The feature store. Only pipeline/graph uses it; a step computes the same values with and without it.
+    """The feature store. Only pipeline/graph uses it; results are the same with and without it.
 
     ``made_by`` describes this process (``pipeline.machine``) in the entries that it completes.
     """
@@ -79,7 +79,7 @@ class Store:
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Keep ``dzop cache gc`` of other processes from the entries that are used inside the block."""
+        """Protect entries used inside the block from ``dzop cache gc`` of other processes."""
         self.join_lease("")
         try:
             yield
@@ -89,7 +89,7 @@ class Store:
                 lease.release()
 
     def join_lease(self, name: str) -> None:
-        """Lease every entry from now on. ``name``: the lease of the process that started this one, "" for a new one."""
+        """Lease every entry used from now on. ``name``: the parent process's lease to join, "" for a new one."""
         self.lease = Lease(self.backend.zarr, name) if self.backend.is_shared else None
 
     # --- state -----------------------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class Store:
         return None if record is None else int(record["bytes"])
 
     def maker(self, ref: Ref) -> Mapping[str, str]:
-        """``made_by`` of a complete entry; empty if it is not complete, or older than this record."""
+        """``made_by`` of a complete entry; empty if it is incomplete or was written by a version without this field."""
         return (self._record(ref) or {}).get("made_by", {})
 
     def _record(self, ref: Ref) -> Mapping[str, Any] | None:
@@ -154,9 +154,9 @@ class Store:
         self._keep_lease()
 
     def _check_used(self) -> None:
-        """Raise DamagedEntry if an entry that was used since the last call is no longer complete, or has other arrays.
+        """Raise DamagedEntry if an entry used since the last call is no longer complete or has other arrays.
 
-        Call this before an entry is completed, so that nothing is computed from what was removed meanwhile.
+        Call this before completing an entry, so that no result depends on entries that were removed meanwhile.
         """
         used, self._used = self._used, {}
         found = read_attributes(self.backend.zarr, [ref.path for ref in used])
@@ -171,7 +171,7 @@ class Store:
     def put_document(self, ref: Ref, document: Any, *, rows: int, time_s: float = 0.0) -> None:
         """Write an entry that is a JSON document without arrays, in one request.
 
-        An entry that another process has completed is left untouched: it may be being read. Raises DamagedEntry when
+        An entry that another process has completed is left untouched, because it may be in use. Raises DamagedEntry if
         an entry that this process has read since its last write was removed or replaced meanwhile.
         """
         self._check_used()
@@ -196,7 +196,7 @@ class Store:
         document: Mapping[str, Any] | None = None,
         advance: Callable[[int], None] = lambda rows: None,
     ) -> FillResult:
-        """Complete several entries that share their rows; only batches with a missing row are computed.
+        """Complete several entries with common rows; only batches with a missing row are computed.
 
         Batches are the same in every run (rows 0..b-1, b..2b-1, ...), so a resumed entry has the same bytes as an
         uninterrupted one. Entries that another process has completed are left untouched. Raises DamagedEntry when an
@@ -225,7 +225,7 @@ class Store:
         return FillResult(computed, rows - computed, time_s)
 
     def _mark_root(self) -> None:
-        """Mark the root as a store, which ``dzop cache`` looks for before it touches anything."""
+        """Write the marker into the store's root, which ``dzop cache`` requires before it changes anything."""
         if not self._has_marker and read_bytes(self.backend.zarr, MARKER) is None:
             write_bytes(self.backend.zarr, MARKER, json.dumps({"format": FORMAT}).encode())
         self._has_marker = True
@@ -233,7 +233,7 @@ class Store:
     # --- maintenance -----------------------------------------------------------------------------------------------
 
     def delete(self, path: str) -> None:
-        """Remove an entry. Raises DzopError for what is not an entry of this format or an older one."""
+        """Remove an entry. Raises DzopError for any other folder, and for an entry of a newer format."""
         attributes = self.attributes(path)
         check_format(attributes or {}, f"{self.place}/{path}")
         if not self.is_ours(path):
@@ -241,7 +241,7 @@ class Store:
         sync(self.backend.zarr.delete_dir(path))
 
     def is_ours(self, path: str) -> bool:
-        """Whether an entry's folder has our marker, or attributes that name its key (before there were markers)."""
+        """Whether an entry's folder has our marker or, in older versions, attributes that name its key."""
         key = path.rpartition("/")[2]
         return is_ours(self.attributes(path) or {}, key) or self._has_entry_marker(path)
 
@@ -259,7 +259,7 @@ class Store:
         return read_attributes(self.backend.zarr, [path])[0]
 
     def stored_bytes(self, path: str) -> int:
-        """Bytes that an entry takes where it is stored."""
+        """Stored bytes of an entry."""
         return stored_bytes(self.backend.zarr, path)
 
 
@@ -270,7 +270,7 @@ def _split(rows: int, batch: int) -> Iterator[list[int]]:
 
 @contextmanager
 def _note_on_error(writers: list[EntryWriter]) -> Iterator[None]:
-    """When the block is interrupted, record the stored rows for the next run, as far as the store still answers."""
+    """If the block is interrupted, record the stored rows for the next run, as long as the store answers."""
     try:
         yield
     except BaseException:
@@ -281,7 +281,7 @@ def _note_on_error(writers: list[EntryWriter]) -> Iterator[None]:
 
 
 def _compute_missing(writers: list[EntryWriter], rows: list[int], compute: Callable[[list[int]], RowValues]) -> int:
-    """Compute a batch if an entry lacks one of its rows, and write it there. Returns the number of rows computed."""
+    """Compute a batch if any entry lacks one of its rows, and write it. Returns the number of rows computed."""
     lacking = [writer for writer in writers if not writer.has(rows)]
     if not lacking:
         return 0
@@ -292,7 +292,7 @@ def _compute_missing(writers: list[EntryWriter], rows: list[int], compute: Calla
 
 
 def _entry_path(key: str) -> str | None:
-    """The path of the entry that a store key belongs to: up to the first part that is a sha256 in hex."""
+    """The path of the entry that a store key belongs to: it ends at the first part that is a sha256 in hex."""
     parts = key.split("/")
     for i, part in enumerate(parts[:-1]):  # a file of such a name is not an entry
         if len(part) == 64 and set(part) <= set("0123456789abcdef"):

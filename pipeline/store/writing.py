@@ -1,9 +1,9 @@
-"""Writing: locks, and an entry that is filled row by row and resumed where an interrupted run stopped.
+"""Write entries: under locks, row by row, resuming where an interrupted run stopped.
 
-With locks, one process writes an entry, and its arrays lie in the entry's folder. S3 has no locks, so two processes may
-write one entry at once, and their bytes may differ: each writes into a folder of its own, and the completion record
-names the folder that counts. Metadata above these folders is the same for all; keys are listed before it is read: a
-writer stores metadata first, so a listed key whose metadata cannot be read is damaged, not new.
+With locks, only one process writes an entry, directly into its folder. S3 has no locks, so two processes may write the
+same entry at once, and their bytes may differ: each writes into its own subfolder, and the completion record names the
+one to use. Metadata above the subfolders is the same for all writers. Keys are listed before metadata is read; since a
+writer stores metadata first, a listed key with unreadable metadata is damaged rather than new.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ from pipeline.store.journal import StoredRows, forget_rows, note_end, note_rows,
 from pipeline.store.keys import Ref
 
 MARKER = ".dzop"
-"""Key in every entry, and in the root of a store, by which they are known as ours whatever else is damaged."""
+"""Marker key in every entry and in a store's root; identifies them as ours even if all else is damaged."""
 
-_NOTE_INTERVAL_S = 0.5  # on a local disk a killed run loses at most this much work; on S3 every batch is noted
+_NOTE_INTERVAL_S = 0.5  # a killed run loses at most this much work on a local disk; on S3 every batch is recorded
 _ROWS_AT_ONCE = 32
 
 
 @contextmanager
 def lock_entries(backend: Backend, refs: Sequence[Ref], announce: Announce) -> Iterator[None]:
-    """Hold the locks of several entries, always taken in the same order so that processes cannot deadlock.
+    """Hold the locks of several entries, acquired in a fixed order so that processes cannot deadlock.
 
     Raises DzopError when the disk is full, the store is read-only, or a file is where the store needs a folder.
     """
@@ -89,8 +89,7 @@ def _explain_disk_errors(backend: Backend, refs: Sequence[Ref]) -> Iterator[None
 class EntryWriter:
     """Fills the arrays of one entry. The caller holds the entry's lock, if there are locks.
 
-    ``folder``: where the arrays are, relative to the entry. ``checksums``: by array and row, of the rows that need no
-    computing.
+    ``folder``: of the arrays, relative to the entry. ``checksums``: by array and row, of the rows already stored.
     """
 
     backend: Backend
@@ -112,10 +111,9 @@ class EntryWriter:
     def open(
         cls, backend: Backend, ref: Ref, layouts: Mapping[str, Layout], rows: int, announce: Announce
     ) -> EntryWriter:
-        """Create the entry, or resume it: intact rows that the journal lists are kept.
+        """Create the entry, or resume it: intact rows listed in the journal are kept.
 
-        Arrays of another layout, or whose metadata was damaged, are replaced: filled again as they are, they would
-        never match a completion record.
+        Arrays with another layout or damaged metadata are replaced, because they could never match a completion record.
         """
         name = token_hex(8)
         folder = "" if backend.has_locks else name
@@ -146,7 +144,7 @@ class EntryWriter:
         return {name: chunk_key(self._path(folder, name), ndim, row) for name, ndim in ndims.items()}
 
     def _keep(self, found: StoredRows) -> None:
-        """Keep the rows of the journal that are intact; those of another writer's folder are copied."""
+        """Keep the journal's intact rows; copy those in another writer's folder."""
         rows = sorted(found.rows.intersection(range(self.rows)).difference(self.stored))
         for first in range(0, len(rows), _ROWS_AT_ONCE):
             sync(self._keep_rows(found, rows[first : first + _ROWS_AT_ONCE]))
@@ -182,18 +180,18 @@ class EntryWriter:
         self.stored.update(rows)
         self._not_noted += rows
         due = not self.backend.has_locks or time.monotonic() - self._noted_s > _NOTE_INTERVAL_S
-        if due and len(self.stored) < self.rows:  # completion follows the last batch at once
+        if due and len(self.stored) < self.rows:  # no need after the last batch: completion follows
             self.note()
 
     def _write_block(self, name: str, array: zarr.Array, block: np.ndarray, rows: Sequence[int]) -> RowChecksums:
-        """Store consecutive rows of one array, directly where that is possible; returns their checksums."""
+        """Store consecutive rows of one array, bypassing Zarr where possible; returns their checksums."""
         if (files := self.files[name]) is not None:
             return files.write(rows, block)
         array[rows[0] : rows[-1] + 1] = block
         return {row: self.recorder.written.pop(self._keys(self.folder, row)[name]) for row in rows}
 
     def note(self) -> None:
-        """Add what was stored since the last call to the journal."""
+        """Add rows stored since the last call to the journal."""
         for first, last in _runs(sorted(self._not_noted)):
             note_rows(
                 self.backend.zarr, self.ref, self.name, folder=self.folder, first=first,
@@ -202,7 +200,7 @@ class EntryWriter:
         self._not_noted, self._noted_s, self._has_notes = [], time.monotonic(), True
 
     def stop(self) -> None:
-        """Add what was stored to the journal, and that this writer has ended without completing the entry."""
+        """Record in the journal the stored rows, and that this writer ended without completing the entry."""
         self.note()
         note_end(self.backend.zarr, self.ref, self.name, folder=self.folder)
 
@@ -210,9 +208,9 @@ class EntryWriter:
         return {name: to_hex(checksums, rows) for name, checksums in self.checksums.items()}
 
     def complete(self, document: Any, time_s: float, made_by: Mapping[str, str]) -> None:
-        """Write the completion record, unless another process has completed the entry with rows of its own.
+        """Write the completion record, unless another process has completed the entry with its own rows.
 
-        Raises DamagedEntry when another process removed rows meanwhile.
+        Raises DamagedEntry if another process removed rows meanwhile.
         """
         (attributes,) = read_attributes(self.backend.zarr, [self.ref.path])
         if attributes is not None and completion_record(attributes, self.ref.key) is not None:
@@ -238,7 +236,7 @@ async def _get_intact(store: ZarrStore, key: str, checksum: bytes) -> Buffer | N
 
 
 def _runs(rows: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """First and last of every run of consecutive numbers."""
+    """First and last number of each consecutive sequence."""
     start = 0
     for i in range(1, len(rows) + 1):
         if i == len(rows) or rows[i] != rows[i - 1] + 1:
@@ -247,10 +245,10 @@ def _runs(rows: Sequence[int]) -> Iterator[tuple[int, int]]:
 
 
 def open_or_create_group(backend: Backend, ref: Ref, attributes: Mapping[str, Any], announce: Announce) -> None:
-    """Make sure that the entry's group exists; ``attributes`` are written if it is new or was made from something else.
+    """Make sure that the entry's group exists; write ``attributes`` if it is new or has another recipe or inputs.
 
-    Also removes the entry's temporary files: only a local store has any, and we hold the lock. Raises NewerEntry for
-    an entry of a newer format.
+    Also removes temporary files, which only local stores have, where we hold the lock. Raises NewerEntry for an entry
+    of a newer format.
     """
     with _lock_parent_groups(backend, ref, announce):
         keys, (found,) = list_keys(backend.zarr, ref.path), read_attributes(backend.zarr, [ref.path])
@@ -266,15 +264,15 @@ def open_or_create_group(backend: Backend, ref: Ref, attributes: Mapping[str, An
         write_bytes(backend.zarr, marker, ref.key.encode())
         try:
             zarr.create_group(backend.zarr, path=ref.path, attributes=dict(attributes))
-        except ContainsGroupError:  # another process created it since the listing
+        except ContainsGroupError:  # another process has created it after the listing
             return
 
 
 @contextmanager
 def _lock_parent_groups(backend: Backend, ref: Ref, announce: Announce) -> Iterator[None]:
-    """Hold the lock for the groups above entries, which Zarr creates along with an entry's group.
+    """Hold the lock for the groups above entries, which Zarr creates together with an entry's group.
 
-    Removes temporary files that a killed run left beside their metadata on a local disk.
+    Removes temporary files that a killed run left next to their metadata on a local disk.
     """
     with backend.lock("groups", _announce_for(ref, announce)):
         if backend.folder is not None:
