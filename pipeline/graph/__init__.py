@@ -1,8 +1,8 @@
 """The cached graph: every intermediate result of a run, and the only code that reads and writes the store.
 
-A node is an entry of the store. Its key follows from specs and from digests of files, so it is known before anything
-is computed: a plan costs nothing, a run computes only what is missing, and a sweep over a matching parameter renders
-and encodes nothing again.
+A node is an entry of the store. Its key is derived from specs and file digests, so it is known before anything is
+computed: plans are free, a run computes only what is missing, and a sweep over a matching parameter reuses all
+renderings and features.
 
 mesh -> templates -> template crops -> template features (by timestep and layer)    templates.py
 template features -> fitted arrays, for stages that need them                       templates.py

@@ -22,7 +22,7 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass(eq=False)
 class StoredBank:
-    """One object's templates as input of the online route; views are read one by one, the last few stay in memory."""
+    """One object's templates as input of the online route. Views are read one by one; the last few stay in memory."""
 
     layer: int
     maps: Callable[[int], torch.Tensor]
@@ -34,7 +34,7 @@ class StoredBank:
 
     @cached_property
     def features(self) -> torch.Tensor:
-        """Maps of the match layer, float16. They are an object's largest array, so they are read on first use."""
+        """Maps of the match layer, float16: an object's largest array, read on first use."""
         return self.maps(self.layer)
 
     @cached_property
@@ -44,12 +44,12 @@ class StoredBank:
 
     @cached_property
     def cell_norms(self) -> torch.Tensor:
-        """Lengths of the cells, float32; computed when a matcher first asks."""
+        """L2 norms of the cells, float32; computed on first use."""
         return cell_norms(self.features)
 
     @cached_property
     def cell_mask(self) -> torch.Tensor:
-        """Foreground cells; computed when a matcher first asks."""
+        """Foreground cells; computed on first use."""
         return cell_mask(self.mask, cells=self.features.shape[-1])
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Checks before a run: layers that an extractor lacks are errors, odd detections and cameras are warnings.
+"""Checks before a run: missing layers are errors, suspicious detections, cameras and meshes are warnings.
 
 Warnings are printed when a run starts and recorded in poses.json.
 """
@@ -20,18 +20,18 @@ from pipeline.items.views import Detection
 from pipeline.method import Stages
 from pipeline.stages.segment import Segmenter
 
-MIN_PIXELS = 16  # smaller masks show no shape
-FULL_SHARE = 0.98  # of the image: such a mask is often inverted, or its colours are
-HALF_SHARE = 0.5  # of the image: a mask this large that also touches all four sides is often the background
-MAX_IDS = 10  # of objects in a warning
-LARGEST_DIAMETER_MM = 10_000.0  # of a mesh without a warning
-MANY_FACES = 1_000_000  # a mesh of more gets a warning with what it costs
-SECONDS_PER_MILLION, GB_PER_MILLION = 5.0, 0.5  # of faces, on one core: benchmarks/meshes.py
-OUTSIDE_SHARE = 0.1  # of a box outside the image: often two corners instead of corner, width and height
+MIN_PIXELS = 16  # masks with fewer pixels have no recognisable shape
+FULL_SHARE = 0.98  # share of the image: a larger mask is often inverted
+HALF_SHARE = 0.5  # share of the image: a larger mask that touches all four sides is often the background
+MAX_IDS = 10  # objects named in a warning
+LARGEST_DIAMETER_MM = 10_000.0  # a mesh of a larger diameter gets a warning
+MANY_FACES = 1_000_000  # a mesh of more faces gets a warning with its cost
+SECONDS_PER_MILLION, GB_PER_MILLION = 5.0, 0.5  # per million faces, on one core: benchmarks/meshes.py
+OUTSIDE_SHARE = 0.1  # share of a box outside the image: such boxes are often two corners instead of corner and size
 
 
 def check_layers(stages: Stages) -> None:
-    """Raise BadInput, naming the field that asked for it, for a layer that the extractor does not have."""
+    """Raise BadInput for a requested layer that the extractor lacks, naming the field that requests it."""
     field_of_layer = {SALIENCY_LAYER: "correspond"} | dict.fromkeys(stages.fuse.layers, "fuse.layers")
     field_of_layer |= dict.fromkeys(stages.match.layers, "match.layers") | {stages.match.layer: "match.layer"}
     for layer in stages.layers:
@@ -46,14 +46,14 @@ def check_layers(stages: Stages) -> None:
             if layer == CLASS_FACET_LAYER:
                 found = f"true, and {stages.extract.kind} has no class token"
                 raise BadInput("match.class_token", found=found, needed="extract=dino, or false") from None
-            needed = error.needed.replace(f", {PSEUDO_LAYERS}", "")  # these fields take no pseudo-layers
+            needed = error.needed.replace(f", {PSEUDO_LAYERS}", "")  # pseudo-layers are not allowed in these fields
             raise BadInput(field_of_layer[layer], found=error.found, needed=needed) from None
 
 
 def settings_warnings(stages: Stages) -> list[str]:
-    """One line per setting that cannot do what it says, because another one leaves it nothing to choose from.
+    """One line per setting that has no effect because of another one.
 
-    ``per_cluster`` at its default is not named: methods with one cluster leave it there.
+    The default ``per_cluster`` is not reported, because methods with a single cluster never set it.
     """
     warnings = []
     top_k, views = getattr(stages.match, "top_k", 0), stages.render.count_views()
@@ -66,9 +66,9 @@ def settings_warnings(stages: Stages) -> list[str]:
 
 
 def detection_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
-    """Warnings of settings, dataset and detector, then one line per suspicious camera, then one per detection.
+    """Warnings about settings, dataset and detector, then one line per suspicious camera, then one per detection.
 
-    Cameras are checked only without ground truth: annotated poses show that a camera is right.
+    Cameras are checked only without ground truth; with it, annotated poses have confirmed them.
     """
     warnings = [*settings_warnings(context.stages), *context.dataset.warnings]
     warnings += context.stages.detect.warnings(context.dataset, context.targets)
@@ -90,7 +90,7 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
 
 
 def box_warnings(detections: Sequence[Detection], segment: Segmenter) -> list[str]:
-    """One line for the detections of which only a box is known, with what that costs."""
+    """One line for all detections that have only a box, with the consequence for their poses."""
     usable = [d for d in detections if d.defect is None]
     boxes = [d for d in usable if d.rle is None]
     if not boxes:
@@ -102,7 +102,7 @@ def box_warnings(detections: Sequence[Detection], segment: Segmenter) -> list[st
 
 
 def mesh_warnings(context: Context, facts_of: Callable[[int], MeshFacts]) -> list[str]:
-    """Diameters that models_info.json states otherwise, then one line per kind of loss or cost and its objects."""
+    """Contradictions of models_info.json, then one line per warning about meshes with the objects concerned."""
     warnings: list[str] = []
     objects: dict[str, list[int]] = {}
     for obj_id in context.object_ids:
@@ -116,7 +116,7 @@ def mesh_warnings(context: Context, facts_of: Callable[[int], MeshFacts]) -> lis
 
 
 def _check_diameter(facts: MeshFacts) -> tuple[str, ...]:
-    """A diameter that few objects have: the usual cause is a scale for a mesh that is in millimetres already."""
+    """Warning about an implausible diameter, usually from a scale applied to a mesh that is already in mm."""
     if facts.diameter_mm <= LARGEST_DIAMETER_MM:
         return ()
     metres = facts.diameter_mm / 1000
@@ -124,7 +124,7 @@ def _check_diameter(facts: MeshFacts) -> tuple[str, ...]:
 
 
 def _check_size(facts: MeshFacts, simplify: int | None) -> tuple[str, ...]:
-    """What a mesh of many faces costs, unless the user has decided how many it may have."""
+    """Cost of a mesh with many faces; empty if the user has set ``dataset.simplify``."""
     if simplify is not None or facts.faces <= MANY_FACES:
         return ()
     millions = facts.faces / 1e6
@@ -133,7 +133,7 @@ def _check_size(facts: MeshFacts, simplify: int | None) -> tuple[str, ...]:
 
 
 def _describe_meshes(names: Sequence[str]) -> str:
-    """``mesh of object 1, 5``, or by the names that a user gave."""
+    """``mesh of object 1, 5``, or the user's names of the objects."""
     numbered = all(name.startswith("object ") for name in names)
     shown = [name.removeprefix("object ") if numbered else name for name in names[:MAX_IDS]]
     of = ("object" if len(names) == 1 else "objects") + " " if numbered else ""

@@ -1,4 +1,4 @@
-"""What all nodes of a run share: stages, data, store and backbone; and how tasks are run and entries are filled."""
+"""Shared state of a run's nodes: stages, data, store and backbone. Runs tasks and fills entries."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pipeline.spec import Runtime
 from pipeline.stages.extract import Backbone
 from pipeline.store import Layout, Ref, Store, make_ref
 
-MESHES_BYTES = 256 << 20  # limit of meshes in memory
+MESHES_BYTES = 256 << 20  # limit for all meshes in memory
 
 Loaded = TypeVar("Loaded", covariant=True)
 ImageId = tuple[int, int]
@@ -35,19 +35,19 @@ ImageId = tuple[int, int]
 
 
 class Loadable(Protocol[Loaded]):
-    """A spec that has weights to load: an extractor or a proposer."""
+    """A spec with weights to load: an extractor or a proposer."""
 
     def load(self, runtime: Runtime) -> Loaded:
-        """Weights into memory."""
+        """Load the weights into memory."""
         ...
 
 
 @dataclass(eq=False)
 class Context:
-    """What all nodes of one run share: stages, data, store and step counts.
+    """Shared state of one run's nodes: stages, data, store and step counts.
 
-    ``workers`` run tasks in other processes; None runs everything in this one. ``calibration``: gives poses a
-    confidence; None where none fits the stages.
+    ``workers`` run tasks in other processes; None runs everything in this one. ``calibration`` gives poses a
+    confidence; None if there is none for these stages.
     """
 
     stages: Stages
@@ -82,7 +82,7 @@ class Context:
         return self.models(obj_id)
 
     def mesh_digest(self, obj_id: int) -> str:
-        """Digest of an object's mesh file, from which keys are made without parsing the mesh."""
+        """Digest of an object's mesh file, used in keys so that the mesh need not be parsed."""
         if obj_id not in self._mesh_digests:
             self._mesh_digests[obj_id] = self.dataset.mesh_digest(obj_id)
         return self._mesh_digests[obj_id]
@@ -98,13 +98,13 @@ class Context:
         return self.load(self.stages.extract)
 
     def load(self, weights: Loadable[Loaded]) -> Loaded:
-        """Load weights. Raises FileChanged if they are no longer, or do not stay, those that keys were made from."""
+        """Load weights. Raises FileChanged if the files differ from those that keys were made from."""
         with unchanged_files():
             return weights.load(self.runtime)
 
     @cached_property
     def device(self) -> str:
-        """Torch name of the device that holds tensors."""
+        """Torch's name of the device for tensors."""
         return self.runtime.torch_device()
 
     def K(self, image: ImageId) -> Float[np.ndarray, "3 3"]:
@@ -116,7 +116,7 @@ class Context:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
     def with_images(self, dataset: Dataset, store: Store) -> Context:
-        """The context of other images of the same objects, with the weights and meshes that this one has in memory."""
+        """A context for other images of the same objects, which shares loaded weights and meshes."""
         other = replace(self, dataset=dataset, targets=dataset.targets, store=store, progress=Progress(False))
         vars(other).update({name: getattr(self, name) for name in ("backbone", "models", "device")})
         other._mesh_digests.update(self._mesh_digests)
@@ -126,7 +126,7 @@ class Context:
 
     @one_thread_per_kernel()
     def run_task(self, task: Task[Item], items: Sequence[Item], advance: Advance) -> None:
-        """Run a task for every item, here or in the workers. Items that are complete are never sent to a worker."""
+        """Run a task for every item, in this process or in workers. Complete items are never sent to a worker."""
         workers = self.workers
         remote = [] if workers is None else [item for item in items if not task.done(item)]
         for item in set(items).difference(remote) if remote else items:
@@ -143,7 +143,7 @@ class Context:
     # --- entries of one kind -----------------------------------------------------------------------------------------
 
     def features(self, layer: int, inputs: Mapping[str, str]) -> Ref:
-        """Features of one layer of some crops, at a readable path."""
+        """Entry of one layer's features of some crops, with a readable path."""
         extract = self.stages.extract
         recipe = {"kind": "features", "extract": extract.recipe(), "layer": layer}
         return make_ref(f"features/{extract.model}/t{extract.timestep}/layer{layer}", recipe, inputs)
@@ -203,7 +203,7 @@ class Context:
             return {ref.key: {"maps": maps[layer]} for layer, ref in missing.items()}
 
         layouts = {ref: self.features_layout(layer) for layer, ref in missing.items()}
-        batch = self.backbone.passes.batch  # loads the weights now, so that a row's seconds do not include it
+        batch = self.backbone.passes.batch  # load the weights now, so that they do not count as time of a row
         timing = timing_key("features", self.stages, list(missing))
         self.fill(step, title, layouts, rows, batch, compute, timing=timing)
 
@@ -214,7 +214,7 @@ class Context:
 
 
 def stack_crops(crops: Sequence[Crop]) -> dict[str, np.ndarray]:
-    """Rows of a crops entry, one for each crop."""
+    """Rows of a crops entry, one per crop."""
     return {name: np.stack([getattr(crop, name) for crop in crops]) for name in ("rgb", "mask", "A_crop_img")}
 
 
@@ -225,7 +225,7 @@ def _mesh_bytes(model: ObjectModel) -> int:
 
 
 def to_half(maps: torch.Tensor, what: str) -> np.ndarray:
-    """Convert to float16 on the CPU. Raises DzopError on overflow: infinite features would give wrong poses."""
+    """Convert to float16 on the CPU. Raises DzopError on overflow, since infinite features lead to wrong poses."""
     half = maps.half()
     if not torch.isfinite(half).all():
         needed = "try extract.dtype=float32 or another layer"

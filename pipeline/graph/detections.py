@@ -23,12 +23,12 @@ from pipeline.spec import digest
 from pipeline.stages.detect import Descriptors
 from pipeline.store import Ref, make_ref
 
-MAX_REASONS = 4  # in the error about detections of which none is usable
+MAX_REASONS = 4  # reasons listed in the error that no detection is usable
 
 
 @dataclass(eq=False)
 class DetectionNodes:
-    """The entry of a run's detections. ``proposals`` is None for detectors without a describer, which read files."""
+    """The entry of a run's detections. ``proposals``: None for detectors that read files and have no describer."""
 
     context: Context
     proposals: ProposalNodes | None
@@ -47,7 +47,7 @@ class DetectionNodes:
         return make_ref("detections", recipe, self._sources() | {"targets": digest(asked)})
 
     def _sources(self) -> dict[str, str]:
-        """Digests of what the detector reads: files, or features of proposals and templates."""
+        """Digests of the detector's inputs: files, or features of proposals and templates."""
         proposals, context = self.proposals, self.context
         if proposals is None:
             files = context.stages.detect.sources(context.dataset, context.targets)
@@ -68,7 +68,7 @@ class DetectionNodes:
     def all(self) -> list[Detection]:
         """Detections of the targets, read from the store or computed.
 
-        Raises BadInput if they come from files and none is usable; a detector may find nothing.
+        Raises BadInput if they come from files and none is usable. A detector that finds nothing is no error.
         """
         store, is_new = self.context.store, not self.context.store.is_complete(self.ref)
         if is_new:
@@ -81,12 +81,12 @@ class DetectionNodes:
         return detections
 
     def identity(self, detection: Detection) -> dict[str, Any]:
-        """The part of a detection that poses depend on: without seconds measured here, which differ in every run."""
+        """The part of a detection that poses depend on: all but the measured seconds, which differ in every run."""
         record = detection_to_record(detection)
         return record | {"time_s": 0.0} if self.proposals else record
 
     def _no_usable_detection(self, detections: Sequence[Detection]) -> BadInput:
-        """The error that lists why, with the first of each reason."""
+        """The error that lists the reasons, each with its first detection."""
         context, first = self.context, {d.defect: d for d in reversed(detections)}
         counts = Counter(d.defect for d in detections).most_common(MAX_REASONS)
         places = [(first[why], n) for why, n in counts]
@@ -102,7 +102,7 @@ class DetectionNodes:
         return [self._segment(d) for d in detections] if self.context.stages.segments else detections
 
     def _segment(self, detection: Detection) -> Detection:
-        """The detection with a mask made from its box, if it has none and one is found; the box stays as given."""
+        """The detection, with a mask segmented inside its box if it had none and that succeeds; keeps the given box."""
         if detection.rle is not None or detection.defect is not None:
             return detection
         photo = self.context.dataset.image(detection.scene_id, detection.im_id)
@@ -110,7 +110,7 @@ class DetectionNodes:
         return detection if mask is None else replace(detection, rle=encode_rle(mask), guessed=True)
 
     def _describe(self, proposals: ProposalNodes) -> Descriptors:
-        """Descriptors of all objects and images, computed where they are missing."""
+        """Descriptors of all objects and images; missing ones are computed."""
         context = self.context
         with context.progress.bar(len(context.object_ids), "descriptions", "object") as advance:
             context.run_task(proposals.describe_task, context.object_ids, advance)
@@ -121,12 +121,12 @@ class DetectionNodes:
 
 
 def _digest_sources(files: Sequence[Path], root: Path) -> str:
-    """Digest of a detector's files, independent of where the dataset lies. Each file counts, whatever its name."""
+    """Digest of a detector's files, independent of the dataset's location. Files of equal name all count."""
     digest_of: dict[str, str] = {}
     for path in dict.fromkeys(files):
         name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
         while name in digest_of:
-            name += "'"  # a photograph and its mask often have one name, in different folders
+            name += "'"  # a photograph and its mask often have the same name, in different folders
         is_json = path.suffix in (".json", ".gz")
         digest_of[name] = file_digest(path) if is_json else image_digest(path, photograph=False)
     lines = "".join(f"{name}\0{content}\n" for name, content in sorted(digest_of.items()))

@@ -30,7 +30,7 @@ from pipeline.scoring import Scorer
 
 
 class Graph:
-    """All nodes of one run. ``templates``: those of another graph with the same stages and objects, kept in memory."""
+    """All nodes of one run. ``templates``: reused from a graph with the same stages and objects."""
 
     def __init__(self, context: Context, templates: TemplateNodes | None = None) -> None:
         self.context = context
@@ -43,7 +43,7 @@ class Graph:
         """Check device, budgets, weights and layers before anything is computed. Raises BadInput."""
         runtime, stages = self.context.runtime, self.context.stages
         self.context.store.made_by = describe_machine(runtime.torch_device())
-        _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for what is not a size
+        _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for text that is no size
         stages.fuse.check(stages.extract)
         check_layers(stages)
         if self.detections.proposals:
@@ -70,7 +70,7 @@ class Graph:
     # --- steps -------------------------------------------------------------------------------------------------------
 
     def onboard(self) -> None:
-        """Compute everything that needs no image, for every object of the targets."""
+        """Compute everything that needs no image, for all objects of the targets."""
         tasks = [self.templates.onboard_task]
         if self.detections.proposals and not self.detections.known:
             tasks.append(self.detections.proposals.describe_task)
@@ -92,12 +92,12 @@ class Graph:
         return self.detection_warnings() + self.mesh_warnings()
 
     def mesh_warnings(self) -> list[str]:
-        """Those on meshes. A mesh is read only if its templates are missing."""
+        """Results of sanity checks on meshes. A mesh is read only if its templates are missing."""
         return mesh_warnings(self.context, self.templates.mesh_facts)
 
     def estimate(self) -> list[Answer]:
         """An answer for every detection of every target, and for every target without one."""
-        # Read detections and meshes first: an error in their files must not appear after hours of onboarding.
+        # Read detections and meshes first, so that errors in their files do not appear after hours of onboarding.
         self.detect()
         if not self.context.store.is_complete(self.poses.run_ref()):
             for obj_id in self.context.object_ids:
@@ -106,16 +106,16 @@ class Graph:
         return self.poses.estimate()
 
     def scores(self, scorer: Scorer, *, correspondences: bool = False) -> ScoreNodes:
-        """The node of the poses' scores, optionally with those of the correspondences they were solved from."""
+        """The node of the poses' scores, optionally including scores of their correspondences."""
         replayer = self.replayer() if correspondences else None
         return ScoreNodes(self.context, self.templates, self.poses, scorer, replayer)
 
     def replayer(self) -> Replayer:
-        """Recomputes how an answer came about, from stored features."""
+        """Recomputes the intermediate results of an answer from stored features."""
         return Replayer(self.templates, self.queries, self.poses)
 
     def machines(self) -> list[str]:
-        """Each machine, with its versions, that computed templates, features or poses of this run, as one line."""
+        """One line per machine, with its versions, that computed templates, features or poses of this run."""
         templates, queries, context = self.templates, self.queries, self.context
         refs = [templates.templates(obj_id) for obj_id in context.object_ids]
         refs += [templates.features(obj_id, layer) for obj_id in context.object_ids for layer in context.stages.layers]
@@ -131,11 +131,11 @@ class Graph:
         if self.detections.proposals:
             tasks += [self.detections.proposals.describe_task, self.detections.proposals.propose_task]
         if task in (self.queries.describe_task.name, self.poses.solve_task.name):
-            self.detect()  # not part of the item's counts
+            self.detect()  # does not belong to the item's counts
         self.context.progress.counts.clear()
         next(t for t in tasks if t.name == task).do(item, lambda steps: None)
         return dict(self.context.progress.counts)
 
     def plan(self) -> Iterator[Node]:
-        """Every node with its state, key, size and cost. Raises NotDownloaded at a key that missing weights decide."""
+        """Every node with its state, key, size and cost. Raises NotDownloaded if a key depends on missing weights."""
         return Plan(self.context, self.templates, self.queries, self.poses, self.detections).nodes()

@@ -16,7 +16,7 @@ from pipeline.graph.proposals import ProposalNodes
 from pipeline.progress import format_bytes
 
 MAX_CACHED_VIEWS = 64
-CACHED_VIEWS_BYTES = 256 << 20  # limit for cached views of a run that has a budget
+CACHED_VIEWS_BYTES = 256 << 20  # limit of cached views if there is a budget
 _BATCH, _BANK, _FITS = "a batch", "one object's templates", "fits to one object's templates"
 _HELP = {
     _BATCH: "extract.dtype=float16 or a smaller extract.input_size",
@@ -41,7 +41,7 @@ class Memory:
 
     @property
     def largest_phase(self) -> str:
-        """The phase that decides the peak."""
+        """The phase with the highest need."""
         return max(self.phases, key=lambda name: self.phases[name], default="")
 
     @property
@@ -72,20 +72,20 @@ class Memory:
 def estimate_peak(context: Context, needs: MemoryNeeds, *, minimal: bool = False) -> tuple[Memory, Memory | None]:
     """Peak memory of the machine, and of the device if that is a GPU.
 
-    ``minimal``: with the smallest batch and one cached view, the least that a run can do with.
+    ``minimal``: with the smallest batch and one cached view, the minimum for a run.
     """
     device = torch.device(context.device)
     process = psutil.Process().memory_info().rss
     batch, batch_bytes = _estimate_batch(context, needs, device, minimal=minimal)
     views = 1 if minimal else count_cached_views(context, needs)
     bank = needs.bank + needs.online + views * needs.view
-    if needs.rerender and needs.footprint is not None:  # a hypothesis is rendered and encoded while the bank is there
+    if needs.rerender and needs.footprint is not None:  # hypotheses are rendered and encoded with the bank in memory
         bank += needs.rerender + bytes_of_batch(needs.footprint, 1, device)
     on_device = {f"{_BATCH} of {batch}": batch_bytes, _BANK: bank} if batch_bytes else {_BANK: bank}
     on_cpu, unknown = {"rendering": needs.render, _FITS: needs.fits}, ", ".join(needs.unknown)
     if device.type == "cpu":
         return Memory({"the process": process, "weights": needs.weights}, on_device | on_cpu, unknown), None
-    loading = {"weights": needs.weights, _BANK: needs.bank}  # both pass through the machine's memory
+    loading = {"weights": needs.weights, _BANK: needs.bank}  # both go through the machine's memory
     machine = Memory({"the process": process}, on_cpu | loading, unknown)
     return machine, Memory({"weights": needs.weights}, on_device, unknown)
 

@@ -15,13 +15,13 @@ from pipeline.graph.timings import timing_key
 from pipeline.io.checkpoints import NotDownloaded
 from pipeline.store import Layout, Ref
 
-KEY_DIGITS = 12  # of a key, in tables and in names of folders
+KEY_DIGITS = 12  # digits of a key shown in tables and names of folders
 TEMPLATE_PIXEL_BYTES = 7  # uint8 rgb and float32 depth, before compression
 
 
 @dataclass(frozen=True)
 class Node:
-    """One entry as a plan shows it. ``cost`` says what computing it takes; "" for a cached entry.
+    """One entry as a plan shows it. ``cost``: what computing it takes; "" for a cached entry.
 
     For a missing entry, ``passes`` counts images through the backbone (once for all layers of one pass) and
     ``seconds`` estimates its time, None if unknown. ``sized`` is False if ``nbytes`` is unknown before it is computed.
@@ -42,8 +42,8 @@ class Node:
 class Plan:
     """Lists the nodes of a run.
 
-    All keys after the detections depend on them. Detections that come from files are read; if they would have to be
-    computed, the list ends with them.
+    All later keys depend on the detections. Detections are read if they come from files; if they would have to be
+    computed, the list ends there.
     """
 
     context: Context
@@ -87,7 +87,7 @@ class Plan:
         yield from self._feature_nodes("template features", of, refs, n)
         refs_of_fits = {fit: self.templates.fitted(obj_id, fit) for fit in stages.fits}
         missing = [fit for fit, ref in refs_of_fits.items() if not self.context.store.is_complete(ref)]
-        share = 1 / len(missing) if missing else 0  # what was timed is all fits of an object together
+        share = 1 / len(missing) if missing else 0  # only the time of all fits of an object together was measured
         for fit, ref in refs_of_fits.items():
             nbytes = fit.array_bytes(stages.extract.feature_shape(fit.layer)[0], n)
             timing = timing_key("fits", stages)
@@ -98,7 +98,7 @@ class Plan:
             yield self._node("template encodings", of, encodings, nbytes, f"{n} templates", timing, n)
 
     def _proposal_nodes(self, proposals: ProposalNodes) -> Iterator[Node]:
-        """The detections and what they are computed from."""
+        """The detections and their inputs."""
         for obj_id in self.context.object_ids:
             yield from self._described_template_nodes(proposals, obj_id)
         for image in self.context.image_ids:
@@ -135,7 +135,7 @@ class Plan:
     def _feature_nodes(
         self, step: str, of: str, refs: Mapping[int, Ref], rows: int, context: Context | None = None
     ) -> Iterator[Node]:
-        """A node per layer. One pass computes all missing layers; its cost counts for the first of them."""
+        """A node per layer. One pass computes all missing layers; its cost is listed with the first of them."""
         context = context or self.context
         missing = [layer for layer, ref in refs.items() if not context.store.is_complete(ref)]
         timing = timing_key("features", context.stages, missing) if missing else ""
@@ -157,7 +157,7 @@ class Plan:
         rows: float = 1,
         passes: int = 0,
     ) -> Node:
-        """A node with its state. ``nbytes`` None: unknown beforehand; ``timing`` "": its seconds are not measured."""
+        """A node with its state. ``nbytes``: None if unknown beforehand; ``timing``: "" if not measured."""
         stored = self.context.store.size(ref)
         if stored is not None:
             return Node(step, of, ref, "cached", stored, "")

@@ -49,7 +49,7 @@ class PoseNodes:
 
     @cached_property
     def groups(self) -> dict[tuple[int, int], list[Target]]:
-        """Targets by (scene_id, obj_id); the poses of a group are one entry."""
+        """Targets by (scene_id, obj_id). The poses of each group are one entry."""
         grouped: dict[tuple[int, int], list[Target]] = {}
         for target in self.context.targets:
             grouped.setdefault((target.scene_id, target.obj_id), []).append(target)
@@ -77,7 +77,7 @@ class PoseNodes:
             inputs[f"fit {n}"] = self.templates.fitted(obj_id, fit).key
         if (encodings := self.templates.encodings(obj_id)) is not None:
             inputs["template encodings"] = encodings.key
-        if (info := self.context.dataset.models_info.get(obj_id)) is not None:  # otherwise measured on the mesh
+        if (info := self.context.dataset.models_info.get(obj_id)) is not None:  # else measured on the mesh
             inputs["object"] = digest([info.diameter_mm, info.symmetries.tolist()])
         elif self.context.dataset.finds_symmetries:
             inputs["object"] = digest(["found", SYMMETRIES_VERSION])
@@ -95,13 +95,13 @@ class PoseNodes:
         return make_ref("poses", recipe, inputs)
 
     def run_ref(self) -> Ref:
-        """The run: the poses of all targets, with their confidence."""
+        """The run's entry: the poses of all targets, with their confidence."""
         calibration = self.context.calibration
         recipe = {"kind": "run"} | ({} if calibration is None else {"calibration": calibration.digest})
         return make_ref("runs", recipe, {f"{s}/{o}": self.poses((s, o)).key for s, o in self.groups})
 
     def estimate(self) -> list[Answer]:
-        """An answer for every detection of every target, and one for every target without a detection."""
+        """One answer per detection of each target, and one per target without a detection."""
         ref = self.run_ref()
         if not self.context.store.is_complete(ref):
             self._make(ref)
@@ -131,7 +131,7 @@ class PoseNodes:
             self.context.run_task(self.queries.describe_task, images, advance)
 
     def _count_reused(self, answers: int) -> None:
-        """Count as reused what this run needed and did not compute."""
+        """Count entries that this run needed but did not compute as reused."""
         usable = sum(len(found) for found in self.queries.of_image.values())
         for step, rows in (("query crops", usable), ("query features", usable), ("poses", answers)):
             count = self.context.progress.step(step)
@@ -162,7 +162,7 @@ class PoseNodes:
         return self.queries.of_target.get((target.scene_id, target.im_id, target.obj_id), [])
 
     def _answers(self, target: Target, bank: StoredBank) -> list[Answer]:
-        """One answer per detection of a target, or one that says that there is no detection."""
+        """One answer per detection of a target, or one stating that there is none."""
         cropped = {found.index: found for found in self.queries.found((target.scene_id, target.im_id))}
         mine = self._detections(target)
         if not mine:
@@ -242,7 +242,7 @@ class PoseNodes:
         return use == "always" or (use == "given" and self.context.dataset.gives_depth)
 
     def _fit_depth(self, T_cam_obj: Float[np.ndarray, "4 4"], d: Detection) -> tuple[Float[np.ndarray, "4 4"], str]:
-        """The pose fitted to the depth image inside the detection, and a note that marks it."""
+        """The pose fitted to the depth image inside the detection, and a note that says so."""
         context, image = self.context, (d.scene_id, d.im_id)
         depth_mm, K, model = context.dataset.depth_mm(*image), context.K(image), context.model(d.obj_id)
         if d.rle is None:
@@ -270,7 +270,7 @@ class PoseNodes:
         return collect_evidence(trace, query, geometry, self.templates.extent(obj_id))
 
     def _canonical(self, T_cam_obj: Float[np.ndarray, "4 4"], obj_id: int) -> Float[np.ndarray, "4 4"]:
-        """The pose, or that of its symmetric copies that stands for all of them where symmetries were found."""
+        """The pose, or the canonical one of its symmetric copies if symmetries were detected on the mesh."""
         if not self.context.dataset.finds_symmetries:
             return T_cam_obj
         return make_canonical(T_cam_obj, self.templates.extent(obj_id).symmetries)

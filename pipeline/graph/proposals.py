@@ -1,4 +1,4 @@
-"""image -> proposals -> crops -> features, and descriptors of proposals and templates, which detectors compare."""
+"""image -> proposals -> crops -> features, and the descriptors of proposals and templates that detectors compare."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from pipeline.store import Ref, make_ref
 class ProposalNodes:
     """Entries of a detector with a describer. Methods without a verb name entries.
 
-    ``context`` has the describer's extractor instead of the route's. Templates and their crops are the same entries as
-    the route's, and so are their features if both use the same extractor.
+    ``context`` has the describer's extractor instead of the route's. Templates and crops are shared with the route, and
+    features too if both use the same extractor.
     """
 
     context: Context
@@ -58,7 +58,7 @@ class ProposalNodes:
                 raise
             needed = f"{error.needed}; or an extractor that has it (extract@detect.describe=NAME)"
             raise BadInput("detect.describe_layer", found=error.found, needed=needed) from None
-        self.describer.proposer.recipe()  # looks for the weights
+        self.describer.proposer.recipe()  # raises if weights are missing
 
     # --- objects ---------------------------------------------------------------------------------------------------
 
@@ -81,7 +81,7 @@ class ProposalNodes:
         advance(1)
 
     def template_descriptors(self, obj_id: int) -> Float[torch.Tensor, "n c"]:
-        """One descriptor for each of an object's templates."""
+        """One descriptor per template of an object."""
         return self._read_descriptors(self.templates.crops(obj_id), self.template_features(obj_id))
 
     # --- images ----------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ class ProposalNodes:
         return make_ref("crops", recipe, inputs)
 
     def features(self, image: ImageId) -> Ref:
-        """Features of these crops; an image without crops has no such entry."""
+        """Features of these crops; an image without crops has no entry."""
         return self.context.features(self.describer.layer, {"crops": self.crops(image).key})
 
     @cached_property
@@ -145,7 +145,7 @@ class ProposalNodes:
         ref, store = self.proposals(image), self.context.store
         is_new = not store.is_complete(ref)
         if is_new:
-            propose = self.proposer  # loads the weights now, so that the seconds below do not include it
+            propose = self.proposer  # load the weights now, so that the seconds below do not include it
             start = time.perf_counter()
             proposals = propose(self.context.dataset.image(*image))
             seconds = time.perf_counter() - start
@@ -169,7 +169,7 @@ class ProposalNodes:
                 crops.append(self.context.stages.crop(photo.rgb, decode_rle(proposal.rle), proposal.bbox_xyxy, photo.K))
                 kept.append(position)
             except NoPose:
-                continue  # what cannot be cropped cannot be matched either
+                continue  # a proposal without a crop cannot be matched either
         if not crops:
             store.put_document(ref, {"kept": []}, rows=0, time_s=time.perf_counter() - start)
             return 0

@@ -1,4 +1,4 @@
-"""image, detections -> query crops -> query features, once per image; and queries read back from the entries."""
+"""image, detections -> query crops -> query features, once per image; and queries, read back from these entries."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class QueryNodes:
         advance(1)
 
     def make_crops(self, image: ImageId) -> list[CroppedDetection]:
-        """Crop an image's detections; the entry records why a detection could not be cropped."""
+        """Crop an image's detections; the entry records why a detection has no crop."""
         ref = self.crops(image)
         if self.context.store.is_complete(ref):
             self.context.progress.add("query crops", reused=self.context.store.read(ref).rows)
@@ -128,7 +128,7 @@ class QueryNodes:
         return self.found(image)
 
     def _crop_detections(self, image: ImageId) -> tuple[list[Crop], dict[str, object]]:
-        """Crops, and a document that says which detections they are and why others failed."""
+        """Crops, and a document with the index of their detections and the reasons why others failed."""
         usable = self.of_image[image]
         photo = self.context.dataset.image(*image)
         crop, crops, kept, failed = self.context.stages.crop, list[Crop](), list[int](), dict[str, str]()
@@ -182,7 +182,7 @@ class QueryNodes:
         return rigid(nearest_rotation(T[:3, :3]), T[:3, 3])  # published rotations are rounded, rays need exact ones
 
     def query(self, found: CroppedDetection) -> tuple[Query, dict[str, float]]:
-        """A detection as input of the online route, and its share of the seconds of its image."""
+        """A detection as input of the online route, and its share of the seconds spent on its image."""
         image = (found.detection.scene_id, found.detection.im_id)
         entries = {layer: self.context.store.read(self.features(image, layer)) for layer in self.context.stages.layers}
         crops = self.context.store.read(self.crops(image))
@@ -197,13 +197,13 @@ class QueryNodes:
         return Query(crop, A_crop_img, self.context.K(image), others=others), share
 
     def _can_guess(self, detection: Detection) -> bool:
-        """Whether there are further guesses at a detection's mask: it had a box alone, and features need no truth."""
+        """Whether to guess further masks of a detection: it had only a box, and the extractor is no oracle."""
         stages = self.context.stages
         boxed = detection.guessed or detection.rle is None
         return boxed and stages.segments and not stages.extract.needs_geometry and not stages.oracle
 
     def _guess_again(self, detection: Detection) -> Iterator[Query]:
-        """The detection with further guesses at its mask, cropped and described anew."""
+        """The detection with further guesses at its mask, each cropped and encoded again."""
         stages = self.context.stages
         photo = self.context.dataset.image(detection.scene_id, detection.im_id)
         for mask in stages.segment.others(photo.rgb, detection.bbox_xyxy):

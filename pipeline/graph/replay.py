@@ -1,4 +1,4 @@
-"""answer -> its intermediate results: repeat the route of its template from stored features."""
+"""answer -> its intermediate results, recomputed from stored features for the template it used."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.parallel import one_thread_per_kernel
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Crops of a detection and of the view it was matched with, and their hypothesis; None for steps not reached."""
+    """Crops of a detection and of the matched view, and the hypothesis; None for steps that were not reached."""
 
     detection: Detection
     query_rgb: UInt8[np.ndarray, "S S 3"]

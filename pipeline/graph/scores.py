@@ -41,7 +41,7 @@ class PoseEvaluation:
     """A run's answers scored against the ground truth.
 
     ``by_answer[i]``: errors of answer i, None without a pose or an instance. ``templates``: angles between the matched
-    template and the true view. ``correspondences``: median error over the diameter, if it was asked for.
+    template and the true view. ``correspondences``: median error over the diameter, if requested.
     """
 
     scored: ScoringResult
@@ -74,7 +74,7 @@ class ScoreNodes:
         return make_ref("scores", recipe, inputs | {"meshes": files_digest(meshes)})
 
     def _depth_digest(self) -> str:
-        """Digest of the measured depth in mm and of the code that it is compared with; why there is none without it."""
+        """Digest of the measured depth and the version of VSD; without depth, the reason why VSD is not computed."""
         scorer, data = self.scorer, self.context.dataset
         if scorer.no_vsd:
             return scorer.no_vsd
@@ -94,7 +94,7 @@ class ScoreNodes:
 
     @property
     def _timing_key(self) -> str:
-        """Digest of what decides the seconds of a target."""
+        """Digest of everything that the seconds per target depend on."""
         scorer = self.scorer
         settings = [scorer.vsd_delta_mm, not scorer.no_vsd, self.replayer is not None, scorer.models]
         return digest(["scores", self.context.dataset.name, settings])
@@ -136,7 +136,7 @@ class ScoreNodes:
     def _template_errors(
         self, answers: Sequence[Answer], by_answer: Sequence[PoseErrors | None]
     ) -> list[list[int | float]]:
-        """Each instance with the angles between the matched template and the true view."""
+        """Angles between the matched template and the true view, by instance."""
         error_of_instance: dict[Instance, TemplateError] = {}
         for answer, errors in zip(answers, by_answer, strict=True):
             instance = _instance(answer, errors)
@@ -151,11 +151,11 @@ class ScoreNodes:
     def _correspondence_errors(
         self, replayer: Replayer, answers: Sequence[Answer], by_answer: Sequence[PoseErrors | None]
     ) -> list[list[int | float]]:
-        """Each instance with the median error of its answer's correspondences over the diameter."""
+        """Median error of the answer's correspondences over the diameter, by instance."""
         rows: list[list[int | float]] = []
         by_object = sorted(zip(answers, by_answer, strict=True), key=lambda pair: pair[0].obj_id)
         with self.context.progress.bar(len(answers), "correspondences", "answer") as advance:
-            for answer, errors in by_object:  # reads each object's templates once
+            for answer, errors in by_object:  # in this order, each object's templates are read once
                 advance(1)
                 instance = _instance(answer, errors)
                 traced = replayer(answer) if instance else None
@@ -190,7 +190,7 @@ def _result_rows(answers: Sequence[Answer]) -> list[tuple[int, ResultRow]]:
 
 
 def _group_by_answer(answers: Sequence[Answer], errors: Sequence[PoseErrors]) -> tuple[PoseErrors | None, ...]:
-    """Errors of each answer against the instance of its detection, otherwise against the one with the least MSSD."""
+    """Errors of each answer against its detection's instance, or else the one with the lowest MSSD."""
     by_row: defaultdict[int, list[PoseErrors]] = defaultdict(list)
     for error in errors:
         by_row[error.row].append(error)
@@ -202,6 +202,6 @@ def _group_by_answer(answers: Sequence[Answer], errors: Sequence[PoseErrors]) ->
 
 
 def _instance(answer: Answer, errors: PoseErrors | None) -> Instance | None:
-    """The annotated instance of an answer: of its detection, otherwise of its errors; None without either."""
+    """The annotated instance of an answer: its detection's, or else that of its errors; None without either."""
     gt_id = errors.gt_id if answer.gt_id is None and errors is not None else answer.gt_id
     return None if gt_id is None else (answer.scene_id, answer.im_id, answer.obj_id, gt_id)

@@ -22,10 +22,10 @@ Counts = Mapping[str, StepCount]
 
 @dataclass(frozen=True)
 class Task(Generic[Item]):
-    """Something to compute for every item of a run.
+    """A computation for every item of a run.
 
-    ``do`` computes one item and advances its progress bar by ``size`` of the item in total; ``done`` says whether all
-    entries of an item are complete.
+    ``do`` computes one item and advances the progress bar by its ``size`` in total; ``done`` says whether all entries
+    of an item are complete.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Workers(Protocol):
     """Other processes, local or remote, that hold the same graph and share the dataset and the store."""
 
     def map(self, task: str, items: Sequence[Any]) -> Iterator[tuple[Any, Counts]]:
-        """Yield each item with its counts as soon as it is finished. Lost workers are replaced.
+        """Yield each item with its counts as soon as it is finished. Workers that die are replaced.
 
         Raises DzopError with the message of the first item that failed.
         """

@@ -60,13 +60,13 @@ class TemplateNodes:
 
     @cached_property
     def mesh_facts(self) -> Callable[[int], MeshFacts]:
-        """What warnings say of an object's mesh: stored with the templates, else found by reading the mesh."""
+        """Warnings about an object's mesh: stored with the templates, else determined from the mesh."""
         return lru_cache(maxsize=None)(self._mesh_facts)
 
     def _mesh_facts(self, obj_id: int) -> MeshFacts:
         ref = self.templates(obj_id)
         if self.context.store.is_complete(ref):
-            stored = self.context.store.read(ref).document.get("mesh")  # absent in entries of older versions
+            stored = self.context.store.read(ref).document.get("mesh")  # missing in entries of older versions
             if stored is not None:
                 return MeshFacts(**(stored | {"warnings": tuple(stored["warnings"])}))
         return self.context.model(obj_id).facts
@@ -119,7 +119,7 @@ class TemplateNodes:
         return Templates(entry.array("rgb", rows), depth_mm, depth_mm > 0, K, entry.array("T_cam_obj", rows))
 
     def make_crops(self, obj_id: int, count: int) -> None:
-        """Crop an object's templates, where that is missing."""
+        """Crop an object's templates if that is missing."""
         ref = self.crops(obj_id)
 
         def compute(rows: list[int]) -> dict[str, dict[str, np.ndarray]]:
@@ -158,7 +158,7 @@ class TemplateNodes:
         return make_ref("fitted", {"kind": "fitted", "fit": fit.recipe()}, inputs)
 
     def make_fitted(self, obj_id: int) -> None:
-        """Compute an object's missing fits, each after the fit that it is based on."""
+        """Compute an object's missing fits, each after the one it is based on."""
         cells, began = lru_cache(maxsize=1)(lambda layer: self._cells(obj_id, layer)), time.perf_counter()
         missing = [
             fit for fit in self.context.stages.fits if not self.context.store.is_complete(self.fitted(obj_id, fit))
@@ -211,7 +211,7 @@ class TemplateNodes:
         return {"maps": Layout((h, w, d + 1), "float16")}
 
     def make_encodings(self, obj_id: int, count: int) -> None:
-        """Encode an object's templates for the first look, where that is missing."""
+        """Encode an object's templates for the first look if that is missing."""
         ref, stages = self.encodings(obj_id), self.context.stages
         if ref is None:
             return
@@ -266,7 +266,7 @@ class TemplateNodes:
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
-        self.context.models.discard(obj_id)  # frees the renderer's structures as well, three times the size of the mesh
+        self.context.models.discard(obj_id)  # also frees the renderer's data, three times the size of the mesh
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.context.stages.layers)
         self.make_fitted(obj_id)
@@ -318,7 +318,7 @@ class TemplateNodes:
 
     @cached_property
     def extent(self) -> Callable[[int], Extent]:
-        """What distances between poses of an object are measured on."""
+        """Extent of an object, for distances between its poses."""
         return lru_cache(maxsize=None)(self._measure_extent)
 
     def _measure_extent(self, obj_id: int) -> Extent:
@@ -328,7 +328,7 @@ class TemplateNodes:
         return measure_extent(model)
 
     def _open(self, obj_id: int) -> tuple[dict[int, Entry], Entry, Entry]:
-        """Entries of an object's features by layer, its crops and its templates."""
+        """Entries of an object: features by layer, crops and templates."""
         read = self.context.store.read
         features = {layer: read(self.features(obj_id, layer)) for layer in self.context.stages.layers}
         return features, read(self.crops(obj_id)), read(self.templates(obj_id))
@@ -336,7 +336,7 @@ class TemplateNodes:
     def _readers(
         self, features: Mapping[int, Entry], crops: Entry, templates: Entry, index: int
     ) -> dict[str, Callable[[], Any]]:
-        """How to read each field of a template."""
+        """A reader for each field of a template."""
 
         def read_crop() -> CropFeatures:
             maps = {layer: self.context.tensor(entry.array("maps", [index])[0]) for layer, entry in features.items()}
@@ -354,7 +354,7 @@ class TemplateNodes:
         return EncodedMap(maps[..., :-1].float().movedim(-1, 0), maps[..., -1] > 0)
 
     def _render_view(self, obj_id: int, T_cam_obj: Pose, A_crop_img: Matrix, K: Matrix) -> TemplateView:
-        """Render the object in a pose as a crop of a query shows it: twice as large, then resampled like a template."""
+        """Render the object in a pose as the query's crop would show it: at twice the size, then resampled."""
         stages, size = self.context.stages, self.context.stages.crop.size
         K_crop, R_crop_cam = crop_camera(A_crop_img, K)
         A_drawn_crop = resize_affine(float(RERENDER_SCALE))

@@ -1,7 +1,7 @@
 """Seconds per row measured by earlier runs on this machine, from which a plan estimates its time.
 
-The file lies beside the store, one for every machine, device and number of threads. Timings are looked up by a digest
-of everything that decides the cost of a row (``timing_key``), so a plan never extrapolates to work that was not
+There is one file per machine, device and number of threads, next to the store. Timings are looked up by a digest of
+everything that the cost of a row depends on (``timing_key``), so a plan never extrapolates to work that was not
 measured. If the file cannot be read or written, plans lack their times; nothing else changes.
 """
 
@@ -41,15 +41,15 @@ class Timings:
             self.measured[key] = [before[0] + rows, before[1] + seconds]
 
     def seconds(self, key: str, rows: float) -> float | None:
-        """Estimated seconds for a number of rows; None if this work was never measured here."""
+        """Estimated seconds for a number of rows; None if this work was never measured on this machine."""
         totals = self._saved.get(key)
         return None if totals is None else rows * totals[1] / totals[0]
 
     def save(self) -> None:
-        """Write this run's measurements. They replace older ones of the same key: the machine may have changed."""
+        """Write this run's measurements, replacing older ones of the same key because the machine may have changed."""
         if self.folder is None or not self.measured:
             return
-        with suppress(DzopError):  # a read-only or full disk, or a file in the folder's place
+        with suppress(DzopError):  # a read-only or full disk, or a file in place of the folder
             write_json(self._path, self._read() | self.measured)
 
     @property
@@ -82,7 +82,7 @@ def _is_usable(rows: float, seconds: float) -> bool:
 
 
 def timing_key(step: str, stages: Stages, layers: Sequence[int] = (), rows: int = 0) -> str:
-    """Digest of everything that decides the seconds of a row. ``rows``: how many templates a query is matched with."""
+    """Digest of everything that the seconds per row depend on. ``rows``: number of templates matched per query."""
     if step == "features":
         # A pass ends at the deepest layer. Pseudo-layers are negative and need the full pass.
         deepest = min(layers) if min(layers) < 0 else max(layers)
