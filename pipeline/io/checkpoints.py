@@ -31,17 +31,17 @@ _offline: ContextVar[bool] = ContextVar("offline", default=False)
 
 
 def sweep_hint(name: str) -> str:
-    """Suffix for messages: the option that sets these weights for every method of a sweep."""
+    """Message suffix with the option that sets these weights for all methods of a sweep."""
     return f" (weights.{name}=FOLDER sets it for all methods)"
 
 
 class NotDownloaded(BadInput):
-    """Weights of a hub id that are not in the local hub cache, inside ``offline()``."""
+    """Inside ``offline()``, the weights of a hub id are not in the local hub cache."""
 
 
 @contextmanager
 def offline() -> Iterator[None]:
-    """Download nothing inside the block: a plan must cost nothing."""
+    """Disable downloads inside the block, because a plan must be free."""
     token = _offline.set(True)
     try:
         yield
@@ -67,7 +67,7 @@ def fetch_snapshot(
     name: str,
     mirrors: Mapping[str, str] = MappingProxyType({}),
 ) -> Path:
-    """Local folder with the hub's files that match ``patterns``, downloaded if necessary.
+    """Local folder with the hub's files matching ``patterns``, downloaded if necessary.
 
     Raises BadInput for ``field`` with the hint ``sweep_hint(name)``, and NotDownloaded inside ``offline()``.
     ``mirrors``: ids that were removed from the hub -> ids that have the same weights, for the message.
@@ -97,7 +97,7 @@ def fetch_snapshot(
 
 
 def _name_remedy(hub_id: str, error: Exception, mirrors: Mapping[str, str]) -> str:
-    """What lets a download succeed that failed with ``error``."""
+    """What to change so that a download that failed with ``error`` succeeds."""
     from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
 
     if hub_id in mirrors:
@@ -140,7 +140,7 @@ def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 def describe_other_content(path: Path) -> str:
-    """What a file holds in place of weights or a config, such as a git-lfs pointer; "" for no known mix-up."""
+    """What a file is instead of weights or a config, such as a git-lfs pointer; "" if it is no known mistake."""
     try:
         with path.open("rb") as file:
             head = file.read(512)
@@ -154,9 +154,9 @@ def describe_other_content(path: Path) -> str:
 
 
 def resolve_hub_cache(folder: Path, field: str) -> Path:
-    """The folder, or the snapshot inside it where it is a model's folder in the hub's cache (refs, blobs, snapshots).
+    """The folder, or the snapshot in it if it is a model's folder in the hub cache (refs, blobs, snapshots).
 
-    Raises BadInput, naming the snapshots, where there is not exactly one.
+    Raises BadInput, listing the snapshots, unless there is exactly one.
     """
     if not ((folder / "snapshots").is_dir() and ((folder / "blobs").is_dir() or (folder / "refs").is_dir())):
         return folder
@@ -169,7 +169,7 @@ def resolve_hub_cache(folder: Path, field: str) -> Path:
 
 
 def check_missing(names: Sequence[str], where: Path) -> None:
-    """Raise BadInput if ``names`` are missing: diffusers and transformers would initialise them at random."""
+    """Raise BadInput for missing ``names``, which diffusers and transformers would initialise at random."""
     if names:
         raise BadInput(where, found=f"no tensor for {names[0]} ({len(names)} missing)", needed="all weights")
 

@@ -1,9 +1,9 @@
-"""SHA-256 digests of files, from which every cache key is made, and a watch on files that change during a run.
+"""SHA-256 digests of files, the basis of all cache keys, and detection of files that change during a run.
 
-A key is made from a file at one moment and its content is read at another. Inside ``track_files`` every file has one
-digest from its first use on, whether it was hashed for a key or read (``io.files.read_file``). Whatever differs later
-raises FileChanged, so that no result of new content is stored under the key of the old one. Libraries that open files
-themselves run inside ``unchanged_files``.
+A file is hashed for a key at one moment and read at another. Inside ``track_files``, a file's digest is fixed at first
+use, whether it was hashed or read (``io.files.read_file``). Any later difference raises FileChanged, so that a result
+of new content is never stored under a key of the old content. Libraries that open files themselves are called inside
+``unchanged_files``.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from pathlib import Path
 
 from pipeline.errors import BadInput, DzopError
 
-_LARGE_BYTES = 1 << 26  # digests of smaller files are not kept on disk
-# Two writes within one tick of a file system's clock leave the same times: up to 2 s on FAT, 1 s on some NFS.
+_LARGE_BYTES = 1 << 26  # digests of smaller files are not cached on disk
+# Two writes within one tick of a file system's clock have the same times: up to 2 s on FAT, 1 s on some NFS.
 _SETTLED_NS = 2_500_000_000
 _ABSENT = "no such file"
 
 
 class FileChanged(DzopError):
-    """A file changed after the run made a key from it or read it."""
+    """A file changed after the run had hashed or read it."""
 
     def __init__(self, path: str) -> None:
         super().__init__(
@@ -36,7 +36,7 @@ class FileChanged(DzopError):
 
 @dataclass(frozen=True)
 class FileState:
-    """What changes with every write of a file. ``settled``: so old that a later write has another time."""
+    """Attributes that change on every write. ``settled``: old enough that a later write has another time."""
 
     size: int
     inode: int
@@ -48,27 +48,27 @@ class FileState:
     def of(cls, path: str) -> FileState:
         """The file's state now. Raises OSError."""
         now, stat = time.time_ns(), os.stat(path)
-        settled = stat.st_ctime_ns < now - _SETTLED_NS  # the kernel sets the ctime; the mtime may be any
+        settled = stat.st_ctime_ns < now - _SETTLED_NS  # the kernel sets the ctime; programs can set the mtime
         return cls(stat.st_size, stat.st_ino, stat.st_mtime_ns, stat.st_ctime_ns, settled)
 
     def is_same(self, before: FileState) -> bool:
-        """Whether nothing was written since ``before``, which must have been settled to be sure."""
+        """Whether the file is unchanged since ``before``; only certain if that was settled."""
         now = (self.size, self.inode, self.mtime_ns, self.ctime_ns)
         return now == (before.size, before.inode, before.mtime_ns, before.ctime_ns)
 
 
 @dataclass(frozen=True)
 class DigestCache:
-    """Digests of large files on disk, one JSON file each: hashing four gigabytes of weights takes seconds.
+    """Disk cache of digests of large files, one JSON file each: hashing four gigabytes of weights takes seconds.
 
-    A file's digest is found again by its resolved path, size, inode, mtime and ctime, so a rewritten file is a miss;
-    what is derived from the content of files is found again by their digests.
+    Digests are looked up by resolved path, size, inode, mtime and ctime, so a rewritten file is a miss; values derived
+    from files are looked up by the files' digests.
     """
 
     folder: Path
 
     def load(self, identity: str) -> str | None:
-        """The sha256 (hex) kept for an identity, None if there is none or what is there is damaged."""
+        """The sha256 (hex) cached for an identity, None if it is missing or damaged."""
         try:
             entry = json.loads(self._entry(identity).read_text())
             digest = str(entry["sha256"])
@@ -77,7 +77,7 @@ class DigestCache:
             return None
 
     def save(self, identity: str, digest: str, path: Path) -> None:
-        """Cache a digest. A folder that cannot be written is ignored: the next run hashes the file again."""
+        """Cache a digest. Does nothing if the folder is not writable; the next run then hashes the file again."""
         entry = self._entry(identity)
         partial = entry.with_suffix(f".{os.getpid()}.partial")
         record = {"path": str(path.resolve()), "sha256": digest, "check": _check(identity, digest)}
@@ -97,15 +97,15 @@ def _identity(path: Path, state: FileState) -> str:
 
 
 def _check(identity: str, digest: str) -> str:
-    """Checksum of a cached digest: a file cut off or zeroed by a power failure is never believed."""
+    """Checksum of a cached digest, which exposes files truncated or zeroed by a power failure."""
     return sha256(f"{identity}\0{digest}".encode()).hexdigest()
 
 
 @dataclass(eq=False)
 class TrackedFiles:
-    """Digests of the files that a run has used, by absolute path; ``_ABSENT`` for a file that it found missing.
+    """Digests of the files that a run has used, by absolute path; ``_ABSENT`` for missing ones.
 
-    ``cache`` keeps digests of large files from run to run, None keeps none.
+    ``cache`` keeps digests of large files between runs; None disables it.
     """
 
     cache: DigestCache | None = None
@@ -127,7 +127,7 @@ class TrackedFiles:
         return self.digests[name]
 
     def record(self, name: str, digest: str) -> None:
-        """Record the digest of a file. Raises FileChanged if it was another one before."""
+        """Record the digest of a file. Raises FileChanged if it differs from the one recorded."""
         if self.digests.setdefault(name, digest) != digest:
             raise FileChanged(name)
 
@@ -143,7 +143,7 @@ class TrackedFiles:
                 raise FileChanged(name)
 
     def _verify(self, name: str) -> FileState:
-        """The state of a file that has the recorded digest. Raises FileChanged."""
+        """The state of a file, once its digest is confirmed. Raises FileChanged."""
         try:
             state = FileState.of(name)
             self.digest(Path(name))
@@ -157,9 +157,9 @@ _tracked: TrackedFiles | None = None
 
 @contextmanager
 def track_files(cache: DigestCache | None = None, known: Mapping[str, str] | None = None) -> Iterator[TrackedFiles]:
-    """Watch the files of one run. ``known``: digests by absolute path that another process of this run has recorded.
+    """Track the files of one run. ``known``: digests by absolute path, recorded by another process of this run.
 
-    A block inside another joins it.
+    A nested block joins the outer one.
     """
     global _tracked
     if _tracked is not None:
@@ -180,9 +180,9 @@ def tracked_digests() -> dict[str, str]:
 
 @contextmanager
 def unchanged_files(paths: Sequence[Path] | None = None) -> Iterator[None]:
-    """Raise FileChanged if one of the files (None: any file used so far) changed since, or changes inside the block.
+    """Raise FileChanged if a file (None: any file used so far) has changed since its first use or does so in the block.
 
-    Files that were neither hashed nor read before are not checked, and outside ``track_files`` none is.
+    Files that were neither hashed nor read before are not checked; outside ``track_files``, none are.
     """
     if _tracked is None:
         yield
@@ -192,15 +192,15 @@ def unchanged_files(paths: Sequence[Path] | None = None) -> Iterator[None]:
 
 
 def record_content(path: Path, content: bytes) -> None:
-    """Record what was read from a file. Raises FileChanged if a key was made from other content."""
+    """Record a file's content that was read. Raises FileChanged if a key was made from other content."""
     if _tracked is not None:
         _tracked.record(os.path.abspath(path), sha256(content).hexdigest())
 
 
 def file_exists(path: Path) -> bool:
-    """Whether there is such a file. Raises FileChanged if it was there before and is not now, or the other way round.
+    """Whether the file exists. Raises FileChanged if that has changed since the last call.
 
-    Use it where a missing file is not an error but leads to other results.
+    Use this where a missing file is no error but changes results.
     """
     exists = path.exists()
     if _tracked is not None:
@@ -223,13 +223,13 @@ def file_digest(path: Path) -> str:
 
 
 def files_digest(paths: Mapping[str, Path]) -> str:
-    """sha256 (hex) of several files and their names; independent of their order and location."""
+    """sha256 (hex) of several files with their names, independent of order and location."""
     lines = "".join(f"{name}\0{file_digest(path)}\n" for name, path in sorted(paths.items()))
     return sha256(lines.encode()).hexdigest()
 
 
 def derived_digest(kind: str, paths: Mapping[str, Path], compute: Callable[[], str]) -> str:
-    """``compute()``: a digest of what files hold, kept for the next run where they are large, by their own digests.
+    """``compute()``, a digest derived from files. For large files it is cached on disk, looked up by their digests.
 
     ``kind``: what is computed, and its version. Raises as ``file_digest``.
     """
@@ -247,7 +247,7 @@ def derived_digest(kind: str, paths: Mapping[str, Path], compute: Callable[[], s
 
 
 def _digest_of(path: Path, state: FileState, cache: DigestCache | None) -> str:
-    """sha256 (hex) of a file; that of a large one is looked up in the cache, and kept there once it is settled."""
+    """sha256 (hex) of a file. Those of large files are cached once the files are settled."""
     usable = cache if cache and state.settled and state.size >= _LARGE_BYTES else None
     found = usable.load(_identity(path, state)) if usable else None
     if found is not None:

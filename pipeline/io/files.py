@@ -16,9 +16,9 @@ IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "TGA")
 
 
 def read_file(path: Path, needed: str) -> bytes:
-    """Bytes of a regular file. Raises BadInput for anything else: reading a pipe or a device may never end.
+    """Bytes of a regular file. Raises BadInput for pipes and devices, since reading them may never end.
 
-    Inside ``track_files`` raises FileChanged if the run has made a key from, or read, other content of this file.
+    Inside ``track_files``, raises FileChanged if the run has hashed or read other content of this file before.
     """
     try:
         if file_exists(path) and not path.is_file():
@@ -32,7 +32,7 @@ def read_file(path: Path, needed: str) -> bytes:
 
 
 def describe_irregular(path: Path) -> str:
-    """What an existing path is that is no regular file."""
+    """What kind of path this is instead of a regular file."""
     return "a folder" if path.is_dir() else "not a regular file"
 
 
@@ -54,7 +54,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_error(path: Path, error: OSError) -> DzopError:
-    """The error to raise when writing ``path`` failed: what went wrong and what to do."""
+    """The error to raise if writing ``path`` failed, with the cause and what to do."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DzopError(f"{path}: the disk is full; make room or write elsewhere, then run again")
     return DzopError(f"{path}: cannot be written ({error.strerror}); write elsewhere, then run again")

@@ -1,4 +1,4 @@
-"""Poses, annotated dataset -> errors of every estimate and correctness of every instance, as BOP scores localisation.
+"""Poses, annotated dataset -> errors per estimate and correctness per instance, by BOP's rules for localisation.
 
 For each target, the ``inst_count`` best-scored estimates are compared with the ``inst_count`` most visible annotated
 instances. Estimates of images or objects that are not targets are ignored.

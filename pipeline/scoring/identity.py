@@ -8,7 +8,7 @@ from pipeline.spec import digest
 
 
 def truth_digest(scorer: Scorer) -> str:
-    """Digest of the targets and their annotations. Scores may be compared if their digests are equal."""
+    """Digest of the targets and their annotations; scores are comparable only if it is equal."""
     content = [
         [t.scene_id, t.im_id, t.obj_id, t.inst_count, scorer.dataset.K(t.scene_id, t.im_id).tolist()]
         + [[gt.gt_id, gt.visib_fract, gt.T_cam_obj.tolist()] for gt in scorer.all_instances(t)]

@@ -1,4 +1,4 @@
-"""One estimate against one annotated instance -> all pose errors."""
+"""One estimate, one annotated instance -> all pose errors."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from pipeline.metrics.vsd import vsd
 from pipeline.stages.render.raycast import render_depth
 
 MSPD_WIDTH_PX = 640
-_PROBES = 128  # vertices that bound MSPD from below; with more the bound takes longer and is hardly tighter
+_PROBES = 128  # vertices for the lower bound of MSPD; more would take longer and hardly tighten it
 
 
 class ScoringMesh:
-    """An object's mesh without its texture, with the vertices that decide its errors."""
+    """An object's mesh without texture, with the vertices that its errors depend on."""
 
     def __init__(self, model: ObjectModel) -> None:
         self.vertices = model.mesh.vertices

@@ -27,12 +27,12 @@ VSD_DELTA_MM = {"itodd": 5.0}
 
 ImageId = tuple[int, int]
 IndexedRows = list[tuple[int, ResultRow]]
-"""Estimates with their indices in the results."""
+"""Estimates with their indices in the results file."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScoringResult:
-    """Errors of each estimate that counts against each instance of its object, and the resulting scores."""
+    """Errors of each scored estimate against each instance of its object, and the resulting scores."""
 
     errors: tuple[PoseErrors, ...]
     scores: Scores
@@ -41,7 +41,7 @@ class ScoringResult:
 
 @dataclass(frozen=True, eq=False)
 class TargetResult:
-    """One target: the instances that count, at which thresholds each was found, and all errors."""
+    """One target: the scored instances, the thresholds at which each was found, and all errors."""
 
     instances: list[GroundTruth]
     errors: list[PoseErrors]
@@ -65,8 +65,8 @@ class Scorer:
     def no_vsd(self) -> str:
         """Why VSD is not computed; "" if it is.
 
-        It is left out for all targets if any has no depth image: a missing image is not an error of 1. The text is part
-        of the cache key of scores.
+        It is skipped for all targets if any lacks a depth image, which must not count as an error of 1. This text is
+        part of the cache key of scores.
         """
         if not self.with_vsd:
             return "not asked for"
@@ -110,7 +110,7 @@ class Scorer:
         results: list[tuple[Target, TargetResult]] = []
         for image_id in self.images:
             image = self._read_image(image_id)
-            with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # estimates may be arbitrarily wrong
+            with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # wrong estimates may overflow
                 for target in by_image[image_id]:
                     results.append((target, self._score_target(image, target, rows, estimates)))
             progress(1)
@@ -163,7 +163,7 @@ class Scorer:
 
 
 def find_instances(instances: list[GroundTruth], rows: IndexedRows, errors: list[PoseErrors]) -> TargetResult:
-    """Which instances are matched to a correct estimate at each threshold; ``rows`` are sorted by score, best first."""
+    """Instances matched to a correct estimate, for each threshold; ``rows`` are sorted by score, best first."""
     of = {(e.row, e.gt_id): e for e in errors}
     table = [[of[index, gt.gt_id] for gt in instances] for index, _ in rows]
     shape = (len(rows), len(instances))
@@ -181,7 +181,7 @@ def find_instances(instances: list[GroundTruth], rows: IndexedRows, errors: list
 
 
 def select_most_visible(truths: Sequence[GroundTruth], target: Target, where: str) -> list[GroundTruth]:
-    """The ``inst_count`` most visible instances, which BOP counts, in the order of the annotations.
+    """The ``inst_count`` most visible instances, which BOP scores, in the order of the annotations.
 
     Raises BadInput if there are more and scene_gt_info.json does not say how visible each one is.
     """

@@ -1,8 +1,8 @@
 """Mesh files -> meshes in millimetres. The only package that uses trimesh's loaders.
 
-Coordinates are taken as millimetres, whatever unit a format prescribes. Materials and textures must lie in the mesh's
-folder or below it, symbolic links resolved; nothing outside is opened, downloaded or unpickled. What a file states is
-in the mesh, or the file is refused by name, or ``Mesh.warnings`` says what is missing.
+Coordinates are taken as millimetres, whatever unit a format prescribes. Materials and textures must be in the mesh's
+folder or below it after resolving symbolic links; nothing outside is opened, downloaded or unpickled. Everything in a
+file ends up in the mesh, or raises an error, or is listed in ``Mesh.warnings`` as missing.
 """
 
 from pipeline.io.meshes.diameter import diameter_mm

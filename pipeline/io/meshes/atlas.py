@@ -18,16 +18,16 @@ from pipeline.io.meshes.corners import split_vertices
 from pipeline.items.objects import Mesh
 
 _MAX_SIDE_PX = 16384
-_MAX_ATLAS_PX = 1 << 27  # 400 MB; larger textures are halved until they fit
-_MIN_SIDE_PX = 16  # textures are not halved below this
-_GUTTER_PX = 8  # border around each texture in an atlas: enough for a minification by 8
+_MAX_ATLAS_PX = 1 << 27  # 400 MB; textures of a larger atlas are halved until they fit
+_MIN_SIDE_PX = 16  # smaller textures are not halved
+_GUTTER_PX = 8  # border around each texture in an atlas, wide enough for minification by 8
 
 
 def join_meshes(path: Path, parts: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one. If one has a texture, all get one: in a common atlas, colours as single texels.
+    """Several meshes as one. If any has a texture, all share an atlas, in which plain colours become single texels.
 
-    Meshes that share a texture (the same array) share its place. Raises BadInput, naming ``path``, for textures that do
-    not fit an atlas.
+    Meshes with the same texture (the same array) share its place. Raises BadInput, naming ``path``, for textures that
+    do not fit.
     """
     if len(parts) == 1:
         return parts[0]
@@ -59,7 +59,7 @@ def _vertex_colours(part: Mesh) -> UInt8[np.ndarray, "v 3"]:
 
 
 def _bake_colours(part: Mesh) -> Mesh:
-    """The mesh with a texture in place of colours: a square palette; each face takes the texel of its mean colour."""
+    """The mesh with colours replaced by a texture: a square palette with a texel for each face's mean colour."""
     mean = np.rint(_vertex_colours(part)[part.faces].mean(axis=1)).astype(np.int64)
     codes, entry = np.unique(mean @ [1 << 16, 1 << 8, 1], return_inverse=True)
     size = int(np.ceil(len(codes) ** 0.5))
@@ -72,7 +72,7 @@ def _bake_colours(part: Mesh) -> Mesh:
 
 
 def _share_atlas(path: Path, parts: Sequence[Mesh]) -> list[Mesh]:
-    """The meshes with one common texture: theirs side by side, repeats written out."""
+    """The meshes with one common texture, in which theirs lie side by side with repeats expanded."""
     textures = {id(part.texture): part.texture for part in parts if part.texture is not None}
     lows, times = _measure_repeats(path, parts)
     halved = 0
@@ -89,7 +89,7 @@ def _share_atlas(path: Path, parts: Sequence[Mesh]) -> list[Mesh]:
         halved += 1
     atlas = np.zeros((height, width, 3), dtype=np.uint8)
     for key, (top, left) in corners.items():
-        # each texture continues into its gutter as a repeat would, so that neighbours do not bleed into it
+        # each texture is repeated into its gutter, so that neighbours do not bleed into it
         gutter = ((_GUTTER_PX, _GUTTER_PX), (_GUTTER_PX, _GUTTER_PX), (0, 0))
         block = np.pad(np.tile(textures[key], (times[key][1], times[key][0], 1)), gutter, mode="wrap")
         atlas[top : top + block.shape[0], left : left + block.shape[1]] = block
@@ -126,7 +126,7 @@ def _measure_repeats(
 
 
 def _pack(sizes: dict[int, Int[np.ndarray, " 2"]]) -> tuple[dict[int, tuple[int, int]], tuple[int, int]]:
-    """Upper left corners (top, left) of rectangles (h, w) in rows of falling height; and the size that holds them."""
+    """Corners (top, left) of rectangles (h, w) packed in rows of descending height, and the total size."""
     area = sum(int(h) * int(w) for h, w in sizes.values())
     width = min(max(int(area**0.5), *(int(w) for _, w in sizes.values())), 4 * _MAX_SIDE_PX)
     corners, top, left, row_height, used = {}, 0, 0, 0, 0

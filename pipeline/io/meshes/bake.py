@@ -1,4 +1,4 @@
-"""Colours of one surface -> a texture of another, close one, with a block of texels for each face."""
+"""Transfer the colours of a surface to the texture of another one nearby, with a block of texels per face."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pipeline.functional.surface import SurfacePoints, face_areas, spread_points
 from pipeline.items.objects import Mesh
 from pipeline.parallel import worker_count
 
-_SAMPLES = 2_000_000  # colours taken from the surface: 10 per pixel of a template of 256 px
-_TEXELS = 500_000  # of the surface's area; blocks take about five times as many, and small faces more
+_SAMPLES = 2_000_000  # samples of the surface: 10 per pixel of a template of 256 px
+_TEXELS = 500_000  # texels for the surface's area; blocks need about five times as many, small faces more
 _WIDTH, _MAX_HEIGHT = 4096, 8192
 _MIN_BLOCK, _MAX_BLOCK = 4, 1024
-_FACING = 4.0  # spacings of samples that a unit of difference between normals counts as
+_FACING = 4.0  # distance, in sample spacings, that a unit of difference between normals adds
 _CHUNK = 1 << 18
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Each face's block of texels: its upper left corner (x, y) and its size. Row 0 of ``faces``' corners is there."""
+    """Each face's block of texels: upper left corner (x, y), where the face's first corner is, and size."""
 
     corner: Int[np.ndarray, "f 2"]
     size: Int[np.ndarray, "f 2"]
@@ -30,9 +30,9 @@ class _Blocks:
 
 
 def bake_texture(source: Mesh, mesh: Mesh) -> Mesh:
-    """``mesh`` with the colours that ``source`` shows at the nearest point that faces the same way."""
+    """``mesh`` with the colours of ``source``, each from the nearest point that faces the same way."""
     faces = _longest_side_first(mesh)
-    faces = faces[_order_by_place(mesh.vertices, faces)]  # at coarse levels, neighbours blend into each other
+    faces = faces[_order_by_place(mesh.vertices, faces)]  # blocks blend into neighbours at coarse mipmap levels
     blocks = _lay_out(mesh.vertices, faces)
     texture = np.zeros((blocks.height, _WIDTH, 3), dtype=np.uint8)
     look_up = _Colours(source)
@@ -55,7 +55,7 @@ def bake_texture(source: Mesh, mesh: Mesh) -> Mesh:
 
 
 def _longest_side_first(mesh: Mesh) -> Int[np.ndarray, "f 3"]:
-    """Faces whose longest side leads from their first to their second corner."""
+    """The faces, rotated so that the longest side is from the first to the second corner."""
     corners = mesh.vertices[mesh.faces]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     first = lengths.argmax(axis=1)[:, None]
@@ -63,7 +63,7 @@ def _longest_side_first(mesh: Mesh) -> Int[np.ndarray, "f 3"]:
 
 
 def _order_by_place(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
-    """Order in which faces of like directions and places follow each other: by octant of the normal, then Morton's."""
+    """Order that keeps faces of similar direction and position together: by normal octant, then Morton code."""
     centres = vertices[faces].mean(axis=1)
     low, extent = centres.min(axis=0), np.ptp(centres, axis=0).max()
     cells = ((centres - low) / max(extent, 1e-30) * 1023).astype(np.int64)
@@ -73,7 +73,7 @@ def _order_by_place(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "
 
 
 def _lay_out(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> _Blocks:
-    """Blocks in rows, those of one size together; sides are powers of two, so that a coarser level keeps them apart."""
+    """Blocks packed in rows by size. Sides are powers of two, so that coarser mipmap levels keep blocks separate."""
     areas = face_areas(vertices, faces)
     width = np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=-1)
     sides = np.stack([width, 2 * areas / np.maximum(width, 1e-30)], axis=-1)
@@ -87,7 +87,7 @@ def _lay_out(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) 
 
 
 def _place(size: Int[np.ndarray, "f 2"]) -> tuple[Int[np.ndarray, "f 2"], int]:
-    """Upper left corners of the blocks, and the height that they fill."""
+    """Upper left corners of the blocks, and their total height."""
     corner, top = np.zeros_like(size), 0
     for w, h in np.unique(size, axis=0)[::-1].tolist():
         chosen = np.flatnonzero((size == (w, h)).all(axis=1))
@@ -100,7 +100,7 @@ def _place(size: Int[np.ndarray, "f 2"]) -> tuple[Int[np.ndarray, "f 2"], int]:
 def _block_texels(
     size: Int[np.ndarray, " 2"],
 ) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"], Float[np.ndarray, "t 3"]]:
-    """x, y and barycentric weights of a block's texels; those beyond the longest side get the nearest on it."""
+    """x, y and barycentric weights of a block's texels, clamped to the nearest point beyond the longest side."""
     y, x = (axis.reshape(-1) for axis in np.indices((size[1], size[0])))
     u, v = x / (size[0] - 1), y / (size[1] - 1)
     beyond = np.maximum(u + v - 1, 0) / 2
@@ -123,7 +123,7 @@ class _Colours:
         self._tree = cKDTree(self._join(points, normals), balanced_tree=False)
 
     def __call__(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-        """The colour of the nearest sample; one whose face points elsewhere counts as farther away."""
+        """The colour of the nearest sample, where a different normal adds to the distance."""
         return self._colours[self._tree.query(self._join(points, normals), workers=worker_count())[1]]
 
     def _join(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"]:

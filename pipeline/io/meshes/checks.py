@@ -1,4 +1,4 @@
-"""Checks that a mesh can be rendered and measured, and that what its file states has arrived."""
+"""Checks that a mesh can be rendered and measured, and that it agrees with what its file states."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from jaxtyping import Float
 from pipeline.errors import BadInput
 from pipeline.items.objects import Mesh
 
-_ROUNDING = 0.01  # of a mesh's largest side: stated bounds may be rounded, or taken before compression
+_ROUNDING = 0.01  # share of a mesh's largest side: stated bounds may be rounded, or from before compression
 
 
 def check_mesh(path: Path, mesh: Mesh) -> None:
-    """Raise BadInput for a mesh without faces or extent, or with an index or number that cannot be used."""
+    """Raise BadInput for a mesh without faces or extent, or with an invalid index or coordinate."""
     check_indices(path, mesh)
     wrong = np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))
     if len(wrong):
@@ -43,7 +43,7 @@ def check_indices(path: Path, mesh: Mesh) -> None:
 
 
 def check_bounds(path: Path, vertices: Float[np.ndarray, "v 3"], stated: Float[np.ndarray, "2 3"]) -> None:
-    """Raise BadInput for vertices whose bounding box is another one than the file states (lowest, highest corner)."""
+    """Raise BadInput if the bounding box of the vertices differs from the one stated (lowest, highest corner)."""
     actual = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
     if not np.isfinite(vertices).all() or not np.isfinite(stated).all():
         return  # reported by check_mesh
@@ -54,7 +54,7 @@ def check_bounds(path: Path, vertices: Float[np.ndarray, "v 3"], stated: Float[n
 
 
 def check_count(path: Path, what: str, found: int, stated: int) -> None:
-    """Raise BadInput for another number of elements than there are vertices, or than the file states."""
+    """Raise BadInput if the number of elements differs from that of vertices, or from what the file states."""
     if found != stated:
         raise BadInput(path, found=f"{found} {what}", needed=f"{stated}")
 

@@ -1,4 +1,4 @@
-"""Colours as mesh files state them -> 8-bit rgb."""
+"""Colours in mesh files -> 8-bit rgb."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from jaxtyping import Num, UInt8
 
 from pipeline.errors import BadInput
 
-_UNIT_LIMIT = 2.0  # floats above 1 by less than this overshoot; above it they are 0..255
+_UNIT_LIMIT = 2.0  # floats up to this are 0..1 with overshoot; larger ones mean 0..255
 
 
 def to_uint8(path: Path, values: Num[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Colours on a scale of 0 to 255, from a file that does not state its scale.
+    """Colours scaled to 0..255, from a file that does not state its scale.
 
     Floats are 0..1, or 0..255 if one exceeds 2. Integers are 0..255, or 0..65535 if one exceeds 255. Raises BadInput
     for other values.
@@ -32,5 +32,5 @@ def to_uint8(path: Path, values: Num[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n
 
 
 def unit_to_uint8(values: Num[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of 0..1 on a scale of 0 to 255, clipped and rounded."""
+    """Colours of 0..1 scaled to 0..255, clipped and rounded."""
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Materials and textures that a mesh file names, read from its own folder only."""
+"""Materials and textures that a mesh file refers to, read from its own folder only."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SIGNATURES = {b"\xabKTX 20": "KTX2 (Basis Universal)", b"DDS ": "DDS", b"\x76\x
 
 
 class Companions:
-    """Reads a mesh file and the files named inside it, once each, and makes the digest of what was read."""
+    """Reads a mesh file and the files it refers to, once each, and computes the digest of all that was read."""
 
     def __init__(self, mesh_path: Path) -> None:
         self.mesh_path = mesh_path
@@ -42,7 +42,7 @@ class Companions:
         return data
 
     def exists(self, name: str) -> bool:
-        """Whether there is a file ``name``. Raises BadInput for a name outside the mesh's folder."""
+        """Whether the file ``name`` exists. Raises BadInput for a name outside the mesh's folder."""
         return (self.mesh_path.parent / self._resolve(name)).is_file()
 
     def texture(self, name: str) -> UInt8[np.ndarray, "H W 3"]:
@@ -52,7 +52,7 @@ class Companions:
         return self._textures[name]
 
     def decode(self, where: object, data: bytes) -> UInt8[np.ndarray, "H W 3"]:
-        """An image file's bytes as 8-bit rgb. ``where``: what to name in an error. Raises BadInput."""
+        """An image file's bytes as 8-bit rgb. ``where``: its name in errors. Raises BadInput."""
         for signature, name in _SIGNATURES.items():
             if data.startswith(signature):
                 raise BadInput(where, found=f"a texture in {name}", needed=f"one of {', '.join(IMAGE_FORMATS)}")
@@ -65,7 +65,7 @@ class Companions:
             raise BadInput(where, found=found, needed="a readable texture image") from None
 
     def reserve(self, where: object, texels: int) -> None:
-        """Count the texels of a texture about to be made. Raises BadInput, naming ``where``, for too many in all."""
+        """Count the texels of a texture to be created. Raises BadInput, naming ``where``, above the total limit."""
         self._texels += texels
         if self._texels > _MAX_TEXELS:
             found = f"textures of {self._texels / 1e6:.0f} megapixels in all"
@@ -82,7 +82,7 @@ class Companions:
         if "\0" in name or len(name) > _MAX_NAME:
             raise BadInput(self.mesh_path, found=f"a reference to {name[:40]!r}...", needed="the name of a file")
         if not (self.mesh_path.parent / relative).is_file():
-            relative = PurePosixPath(unquote(str(relative)))  # glTF writes a blank as %20
+            relative = PurePosixPath(unquote(str(relative)))  # glTF encodes a blank as %20
         outside = relative.is_absolute() or ".." in relative.parts or ":" in str(relative) or str(relative) == "."
         if outside or self._links_outside(relative):
             raise BadInput(self.mesh_path, found=f"a reference to {name!r}", needed="a file in the mesh's own folder")

@@ -18,7 +18,7 @@ def split_vertices(
     """Vertices, faces and values by vertex, from ``corners``: the k values at each corner of each face.
 
     A vertex whose corners have different values gets a copy for each further value, after the last vertex. Invalid
-    face indices are returned as they are, with values of 0, for ``check_indices`` to report.
+    face indices are kept, with values of 0, for ``check_indices`` to report.
     """
     if faces.min() < 0 or faces.max() >= len(vertices):
         return vertices, faces, np.zeros((len(vertices), corners.shape[-1]))
@@ -34,7 +34,7 @@ def split_vertices(
 
 
 def split_face_colours(mesh: Mesh, face_colours: UInt8[np.ndarray, "f 3"]) -> Mesh:
-    """The mesh with a colour per vertex; a vertex between faces of different colours is split."""
+    """The mesh with a colour per vertex; vertices between faces of different colours are split."""
     corners = np.repeat(face_colours[:, None].astype(float), 3, axis=1)
     vertices, faces, colours = split_vertices(mesh.vertices, mesh.faces, corners)
     return Mesh(vertices, faces, colours=colours.astype(np.uint8))

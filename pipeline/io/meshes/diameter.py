@@ -9,7 +9,7 @@ from pipeline.items.objects import Mesh
 
 
 def diameter_mm(mesh: Mesh) -> float:
-    """Largest distance between two vertices that faces use, mm; a scan's stray vertices do not count."""
+    """Largest distance between two vertices of faces, mm. Unused vertices, which scans may have, do not count."""
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[mesh.faces] = True
     return point_diameter(mesh.vertices[used])

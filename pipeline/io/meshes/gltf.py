@@ -1,7 +1,6 @@
-"""glTF and glb files: every primitive at its node's place, as one mesh.
+"""glTF and glb files: all primitives, transformed by their nodes, as one mesh.
 
-Colours are taken as they would be displayed: factors and vertex colours are not converted from linear light, which
-few writers observe.
+Colours are taken as sRGB: the format prescribes linear factors and vertex colours, but few exporters comply.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def _find_roots(nodes: list[dict[str, Any]]) -> list[int]:
 
 
 def _check_node(gltf: GltfFile, node: dict[str, Any]) -> tuple[str, ...]:
-    """Warnings of what moves a node's vertices and is not read."""
+    """Warnings about extensions, skins and morph targets, which would move vertices but are not applied."""
     for name in node.get("extensions", {}):
         if "instancing" in name:
             raise BadInput(gltf.path, found=f"copies of a mesh by {name}", needed=REMEDY)
@@ -92,7 +91,7 @@ def _node_transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
 
 
 def _place(part: Mesh, T: Float[np.ndarray, "4 4"], notes: tuple[str, ...]) -> Mesh:
-    """The part in the scene's frame; a mirrored one keeps its outside."""
+    """The part in the scene's frame. Faces are flipped if the transform mirrors, so that the outside stays outside."""
     faces = part.faces[:, ::-1] if np.linalg.det(T[:3, :3]) < 0 else part.faces
     vertices = part.vertices if np.array_equal(T, np.eye(4)) else part.vertices @ T[:3, :3].T + T[:3, 3]
     return replace(part, vertices=vertices, faces=faces, warnings=part.warnings + notes)
@@ -137,7 +136,7 @@ class _Primitives:
     def _add_texture(
         self, mesh: Mesh, surface: Surface, uv: Float[np.ndarray, "v 2"], colours: Float[np.ndarray, "v 3"] | None
     ) -> Mesh:
-        """The mesh with its texture, times the factor and the vertices' colour if that is the same everywhere."""
+        """The mesh with its texture, times the factor and, if uniform, the vertex colour."""
         check_count(self._gltf.path, "texture coordinates", len(uv), len(mesh.vertices))
         factor, notes = np.array(surface.factor or _WHITE), mesh.warnings
         if colours is not None:
@@ -152,7 +151,7 @@ class _Primitives:
 
 
 def _add_colours(mesh: Mesh, surface: Surface, colours: Float[np.ndarray, "v 3"] | None) -> Mesh:
-    """The mesh with its vertices' colours times the material's, either of them, or none."""
+    """The mesh with the product of vertex colours and material colour, as far as there are any."""
     if surface.info is not None:
         note = f"its texture has no coordinates {surface.uv_name}"
         mesh = replace(mesh, warnings=(*mesh.warnings, note))
@@ -174,7 +173,7 @@ def _to_triangles(indices: Integer[np.ndarray, " n"], mode: int) -> Int[np.ndarr
 
 
 class _Attributes:
-    """Numbers of a primitive's vertices by their names, stored plainly or with Draco."""
+    """Attributes of a primitive by name, stored plainly or compressed by Draco."""
 
     def __init__(self, gltf: GltfFile, primitive: dict[str, Any]) -> None:
         self._gltf, self._primitive = gltf, primitive
@@ -185,7 +184,7 @@ class _Attributes:
             self._draco = _decode_draco(gltf.path, gltf.view(draco["bufferView"]), draco["attributes"])
 
     def floats(self, name: str) -> Float[np.ndarray, "n k"]:
-        """An attribute as numbers; normalized integers become 0..1 or -1..1."""
+        """An attribute's values; normalized integers become 0..1 or -1..1."""
         index = self.names[name]
         if name not in self._draco:
             return self._gltf.floats(index)

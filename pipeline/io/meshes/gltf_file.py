@@ -16,15 +16,15 @@ from pipeline.io.meshes.companions import Companions
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_MAX_UNSTORED = 1_000_000  # elements of an accessor without a buffer: they take memory but no bytes in the file
+_MAX_UNSTORED = 1_000_000  # limit for accessors without a buffer, which take memory but no bytes in the file
 _READ = {"KHR_mesh_quantization", "KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_texture_webp"}
 _HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation_", "EXT_lights_", "KHR_node_visibility")
-"""They change reflections, light or records; not where the surface is, nor its base colour."""
+"""Extensions that may be ignored: they change neither the surface nor its base colour."""
 REMEDY = "a file without it: export it again, uncompressed"
 
 
 class GltfFile:
-    """Reads parts of a glTF file on demand. Every method raises BadInput, or what broken JSON leads to."""
+    """Reads parts of a glTF file on demand. Methods raise BadInput, or lookup and type errors for malformed JSON."""
 
     def __init__(self, path: Path, data: bytes, companions: Companions) -> None:
         self.path, self._companions = path, companions

@@ -56,7 +56,7 @@ class Textures:
     def make(
         self, surface: Surface, uv: Float[np.ndarray, "v 2"], factor: tuple[float, ...]
     ) -> tuple[UInt8[np.ndarray, "H W 3"], Float[np.ndarray, "v 2"], tuple[str, ...]]:
-        """The texture times ``factor``, its coordinates (origin at the lower left), and warnings."""
+        """The texture times ``factor``, its coordinates (origin at the lower left) and warnings."""
         assert surface.info is not None
         texture = self._gltf.list("textures")[surface.info["index"]]
         uv = _transform(uv, surface.info.get("extensions", {}).get("KHR_texture_transform", {}))
@@ -100,7 +100,7 @@ class Textures:
 
 
 def _transform(uv: Float[np.ndarray, "v 2"], transform: dict[str, Any]) -> Float[np.ndarray, "v 2"]:
-    """KHR_texture_transform; the sense of rotation is that of Khronos' sample viewer and three.js."""
+    """Apply KHR_texture_transform; rotates in the same direction as Khronos' sample viewer and three.js."""
     angle = float(transform.get("rotation", 0))
     rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     scale, offset = np.reshape(transform.get("scale", (1, 1)), 2), np.reshape(transform.get("offset", (0, 0)), 2)
@@ -108,7 +108,7 @@ def _transform(uv: Float[np.ndarray, "v 2"], transform: dict[str, Any]) -> Float
 
 
 def _unfold(image: UInt8[np.ndarray, "h w 3"], mirror_x: bool, mirror_y: bool) -> UInt8[np.ndarray, "H W 3"]:
-    """The image beside its mirror image, so that plain repeats look like mirrored ones."""
+    """The image next to its mirror image, so that repeating it looks like a mirrored repeat."""
     if mirror_x:
         image = np.concatenate([image, image[:, ::-1]], axis=1)
     return np.concatenate([image, image[::-1]], axis=0) if mirror_y else image

@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.errors import BadInput
 
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-bm": 1, "-boost": 1}
-_OPTIONS |= {"-colorspace": 1, "-type": 1, "-mm": 2}  # how many words follow; -o, -s and -t take up to three numbers
+_OPTIONS |= {"-colorspace": 1, "-type": 1, "-mm": 2}  # number of arguments; -o, -s and -t take up to three numbers
 
 
 @dataclass
@@ -22,7 +22,7 @@ class Material:
 
 
 def parse_mtl(path: Path, data: bytes) -> dict[str, Material]:
-    """Materials by name. Raises BadInput for an option of a texture that changes its colours."""
+    """Materials by name. Raises BadInput for texture options that change colours."""
     materials: dict[str, Material] = {}
     material = Material()
     for line in data.decode(errors="replace").replace("\\\n", " ").splitlines():
@@ -48,7 +48,7 @@ def _parse_colour(path: Path, text: str) -> tuple[float, ...] | None:
 
 
 def _parse_texture(path: Path, text: str, material: Material) -> None:
-    """The file's name, which may contain blanks, and what its options change."""
+    """The file name, which may contain blanks, and the scale and offset from its options."""
     words = text.split()
     while words and words[0].lower() in ("-o", "-s", "-t", *_OPTIONS):
         option = words.pop(0).lower()
@@ -70,7 +70,7 @@ def _parse_texture(path: Path, text: str, material: Material) -> None:
 
 
 def _tail(text: str, words: list[str]) -> int:
-    """Length of the end of the text that consists of these words, with the blanks between them."""
+    """Length of the end of the text made of these words and the blanks between them."""
     at = len(text)
     for word in reversed(words):
         at = text.rindex(word, 0, at)

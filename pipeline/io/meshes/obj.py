@@ -1,4 +1,4 @@
-"""obj files: parsed from whole columns of numbers, since a loop over the lines of a scan takes minutes."""
+"""obj files, parsed column-wise with NumPy: a loop over the lines of a scan would take minutes."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from pipeline.io.meshes.text import parse_numbers
 from pipeline.items.objects import Mesh
 
 _MISSING = int(np.iinfo(np.int64).min)  # a corner without texture coordinate
-_MAX_FORMS = 16  # of faces that are parsed together; rarer ones line by line
-_MAX_COLUMNS = 8  # of numbers after v; further ones are ignored
+_MAX_FORMS = 16  # most frequent forms of faces, which are parsed together; others are parsed line by line
+_MAX_COLUMNS = 8  # numbers read after v; further ones are ignored
 
 
 @dataclass(frozen=True)
 class _Lines:
-    """An obj's bytes and where its lines start. ``kind``: the first two bytes of each, as one number."""
+    """An obj's bytes and the starts of its lines. ``kind``: the first two bytes of each line as one number."""
 
     data: UInt8[np.ndarray, " d"]
     start: Int[np.ndarray, " n"]
     kind: Int[np.ndarray, " n"]
 
     def select(self, word: bytes) -> Int[np.ndarray, " m"]:
-        """Indices of the lines that start with this keyword, or these letters of one."""
+        """Indices of the lines that start with this keyword or the first letters of one."""
         if len(word) == 1:
             return np.flatnonzero((self.kind == (word[0] << 8) + 32) | (self.kind == (word[0] << 8) + 9))
         return np.flatnonzero(self.kind == (word[0] << 8) + word[1])
 
     def count(self, marks: Bool[np.ndarray, " d"]) -> Int[np.ndarray, " n"]:
-        """How many marked bytes each line has."""
+        """Number of marked bytes in each line."""
         marked = np.flatnonzero(marks)
         return np.diff(np.searchsorted(marked, self.start), append=len(marked))
 
     def text(self, rows: Int[np.ndarray, " m"], skip: int) -> bytes:
-        """These lines, their first ``skip`` bytes blank."""
+        """These lines, with their first ``skip`` bytes replaced by blanks."""
         chosen = np.zeros(len(self.start), dtype=bool)
         chosen[rows] = True
         lengths = np.diff(self.start, append=len(self.data))
@@ -65,7 +65,7 @@ class _Lines:
 
 @dataclass(frozen=True)
 class _Faces:
-    """Polygons: the vertex and texture coordinate (or ``_MISSING``) at each corner, and the lines they come from."""
+    """Polygons: vertex and texture coordinate (or ``_MISSING``) of each corner, and the line each came from."""
 
     vertex: Ragged
     uv: Int[np.ndarray, " c"]
@@ -105,7 +105,7 @@ def parse_obj(path: Path, data: bytes, companions: Companions) -> Mesh:
 
 
 def _split_lines(data: bytes) -> _Lines:
-    """The lines without blanks before keywords and without comments after numbers."""
+    """The lines without leading blanks and without comments after numbers."""
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b"  ") + b"\n"
     if data[:1] in b" \t" or b"\n " in data or b"\n\t" in data:
         data = re.sub(rb"^[ \t]+", b"", data, flags=re.MULTILINE)
@@ -124,13 +124,13 @@ def _locate_lines(data: bytes) -> _Lines:
 
 
 def _count_words(lines: _Lines) -> Int[np.ndarray, " n"]:
-    """Number of words in each line, its keyword included."""
+    """Number of words in each line, including its keyword."""
     blank = lines.data <= 32
     return lines.count(np.concatenate([~blank[:1], blank[:-1] & ~blank[1:]]))
 
 
 def _parse_table(path: Path, lines: _Lines, word: bytes, least: int, words: Int[np.ndarray, " n"]) -> np.ndarray:
-    """The numbers of all lines with this keyword, one row a line; NaN where a line has fewer than the longest."""
+    """The numbers of all lines with this keyword, one row per line; shorter lines are padded with NaN."""
     rows = lines.select(word)
     if not len(rows):
         return np.zeros((0, least))
@@ -155,7 +155,7 @@ def _parse_table(path: Path, lines: _Lines, word: bytes, least: int, words: Int[
 def _parse_vertices(
     path: Path, lines: _Lines, words: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "v 3"], UInt8[np.ndarray, "v 3"] | None]:
-    """Positions, and colours if any vertex has one: grey where one has none."""
+    """Positions, and colours if any vertex has one; the others are grey."""
     table = _parse_table(path, lines, b"v", 3, words)
     vertices = np.ascontiguousarray(table[:, :3])
     if table.shape[1] < 6:
@@ -167,7 +167,7 @@ def _parse_vertices(
 
 
 def _parse_uv(path: Path, lines: _Lines, words: Int[np.ndarray, " n"]) -> Float[np.ndarray, "t 2"]:
-    """Texture coordinates; the second is 0 where only one is given."""
+    """Texture coordinates; a missing second one is 0."""
     table = _parse_table(path, lines, b"vt", 1, words)[:, :2]
     return np.stack([table[:, 0], np.zeros(len(table)) if table.shape[1] < 2 else table[:, 1]], axis=-1)
 
@@ -203,7 +203,7 @@ def _parse_faces(path: Path, lines: _Lines, words: Int[np.ndarray, " n"]) -> _Fa
 def _group_alike(
     counts: Int[np.ndarray, " f"], slashes: Int[np.ndarray, " f"], pairs: Int[np.ndarray, " f"]
 ) -> Iterator[Int[np.ndarray, " g"]]:
-    """Indices of the lines of faces of equal form, for the most frequent forms."""
+    """Line indices of faces with the same form, for the most frequent forms."""
     if not len(counts):
         return
     form = (counts * (slashes.max() + 1) + slashes) * (pairs.max() + 1) + pairs
@@ -224,7 +224,7 @@ def _corner_shape(count: int, slashes: int, pairs: int) -> tuple[int, int, bool]
 
 
 def _parse_face(path: Path, line: str) -> tuple[list[int], list[int]]:
-    """Vertices and texture coordinates of one line whose corners are not all alike."""
+    """Vertices and texture coordinates of one line whose corners differ in form."""
     vertex, uv = [], []
     for corner in line.split()[1:]:
         found = re.fullmatch(r"([+-]?\d{1,18})(?:/([+-]?\d{1,18})?(?:/(?:[+-]?\d{1,18})?)?)?", corner)
@@ -254,7 +254,7 @@ def _resolve(
 
 
 def _read_uses(lines: _Lines, face_lines: Int[np.ndarray, " f"]) -> tuple[list[str], Int[np.ndarray, " f"]]:
-    """Names of the materials in use, "" for none, and the one of each polygon."""
+    """Names of the materials in use ("" for none), and the material index of each polygon."""
     numbers, rows, used = {"": 0}, [], [0]
     for row in lines.select(b"us").tolist():
         word, *name = lines.line(row).split(None, 1)
@@ -301,7 +301,7 @@ def _make_parts(surface: _Surface, companions: Companions) -> list[Mesh]:
 
 
 def _colour_part(mesh: Mesh, faces: Int[np.ndarray, " g"], material: Material, notes: tuple[str, ...]) -> Mesh:
-    """Faces with their vertices' colours, or else the material's, or else none."""
+    """Faces with vertex colours, else the material's colour, else none."""
     part = replace(select_faces(mesh, faces), warnings=notes)
     if part.colours is not None or material.colour is None:
         return part
@@ -312,7 +312,7 @@ def _colour_part(mesh: Mesh, faces: Int[np.ndarray, " g"], material: Material, n
 def _texture_part(
     surface: _Surface, faces: Int[np.ndarray, " g"], material: Material, texture: UInt8[np.ndarray, "H W 3"]
 ) -> Mesh:
-    """Faces with a texture; a vertex is copied for each of its texture coordinates."""
+    """Textured faces; vertices are duplicated so that each has one texture coordinate."""
     vertex, coordinate = surface.mesh.faces[faces].reshape(-1), surface.uv_index[faces].reshape(-1)
     _, row, inverse = np.unique(vertex * len(surface.uv) + coordinate, return_index=True, return_inverse=True)
     uv = surface.uv[coordinate[row]] * material.scale + material.offset

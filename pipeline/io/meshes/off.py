@@ -49,7 +49,7 @@ def parse_off(path: Path, data: bytes) -> Mesh:
 
 
 def _parse_vertices(path: Path, lines: list[str]) -> Num[np.ndarray, "v k"]:
-    """The numbers of each vertex, of as many columns as the shortest line has."""
+    """The numbers of each vertex, with as many columns as the shortest line."""
     words = [line.split() for line in lines]
     columns = min(map(len, words))
     if columns < 3:
@@ -58,7 +58,7 @@ def _parse_vertices(path: Path, lines: list[str]) -> Num[np.ndarray, "v k"]:
 
 
 def _to_colours(path: Path, values: Num[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Whole numbers are 0..255, others 0..1: the text does not tell 1 from 1.0."""
+    """Integers are 0..255, other numbers 0..1; after parsing, 1 and 1.0 are the same."""
     whole = bool((values == np.rint(values)).all()) and values.max() > 1
     return to_uint8(path, values.astype(np.int64) if whole else values)
 

@@ -29,7 +29,7 @@ _UNSEEN = ("specular", "ambient", "emissi")  # reflections and light: not the co
 class Surface:
     """A ply without its textures. ``corners``: index of each triangle's corners in the lists of ``polygons``.
 
-    ``revised``: read otherwise than by the first version of this reader, so that its digest must differ.
+    ``revised``: whether version 1 of this reader gave another mesh, so that the digest must differ.
     """
 
     header: Header
@@ -42,12 +42,12 @@ class Surface:
 
     @property
     def polygon(self) -> Int[np.ndarray, " f"]:
-        """Index of the polygon that each triangle is part of."""
+        """Polygon index of each triangle."""
         return np.searchsorted(self.polygons.starts, self.corners[:, 0], side="right") - 1
 
 
 def parse_ply(path: Path, data: bytes, companions: Companions) -> tuple[Mesh, bool]:
-    """The mesh in a ply's bytes, not checked yet, and whether it is read otherwise than before. Raises BadInput."""
+    """The mesh in a ply's bytes, not checked yet, and whether version 1 gave another one. Raises BadInput."""
     surface = read_surface(path, data)
     textures = [companions.texture(name) for name in surface.header.textures]
     if not textures:
@@ -70,7 +70,7 @@ def parse_ply(path: Path, data: bytes, companions: Companions) -> tuple[Mesh, bo
 
 
 def read_surface(path: Path, data: bytes) -> Surface:
-    """Triangles and colours in a ply's bytes; no other file is opened. Raises BadInput."""
+    """Triangles and colours in a ply's bytes, without opening other files. Raises BadInput."""
     header = read_header(path, data)
     lengths = {element.name: element.length for element in header.elements}
     if lengths.get("tristrips") and not lengths.get("face"):
@@ -122,7 +122,7 @@ def _polygons(path: Path, face: Columns) -> Ragged:
 
 
 def _add_colours(path: Path, surface: Surface) -> Surface:
-    """With the vertices' colours, or else the faces'."""
+    """The surface with vertex colours, or else face colours."""
     colours, revised = _colours(path, surface.vertex)
     if colours is not None:
         mesh = replace(surface.mesh, colours=colours)
@@ -144,7 +144,7 @@ def _add_colours(path: Path, surface: Surface) -> Surface:
 
 
 def _colours(path: Path, columns: Columns) -> tuple[UInt8[np.ndarray, "n 3"] | None, bool]:
-    """Colours, None without any; and whether they are read otherwise than before."""
+    """Colours, None if there are none, and whether version 1 read them differently."""
     names = _colour_names([name for name, column in columns.items() if isinstance(column, np.ndarray)])
     if names is None:
         return None, False

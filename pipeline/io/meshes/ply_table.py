@@ -1,4 +1,4 @@
-"""A ply's header and bytes -> columns of numbers, lists of any length included."""
+"""A ply's header and bytes -> columns of numbers, including lists of any length."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_HEADER = 1 << 16  # bytes
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an element; ``count`` is the type of a list's length, None for a single number."""
+    """A property of an element. ``count``: type of a list's length, None for a single number."""
 
     name: str
     dtype: np.dtype[Any]
@@ -41,7 +41,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """A ply's header. ``start``: of the numbers, in bytes."""
+    """A ply's header. ``start``: byte offset of the data."""
 
     encoding: str
     elements: tuple[Element, ...]
@@ -88,7 +88,7 @@ def _parse_property(words: Sequence[str]) -> Property:
 
 
 def read_columns(path: Path, data: bytes, header: Header) -> dict[str, Columns]:
-    """The columns of every element, by its name. Raises BadInput for other numbers than the header declares."""
+    """The columns of every element, by name. Raises BadInput if the data do not match the header."""
     body = _Numbers(data[header.start :]) if header.encoding == "ascii" else _Bytes(data, header)
     start, tables = 0, {}
     for element in header.elements:
@@ -115,11 +115,11 @@ class _Bytes:
         return len(self.units)
 
     def size(self, dtype: np.dtype[Any]) -> int:
-        """Units that one number takes."""
+        """Units that one number occupies."""
         return dtype.itemsize
 
     def take(self, dtype: np.dtype[Any], positions: Int[np.ndarray, " n"], count: int = 1) -> np.ndarray:
-        """``count`` numbers from each position on, one row after the other."""
+        """``count`` numbers starting at each position, row by row."""
         size = dtype.itemsize * count
         if not len(positions) or not size:
             return np.zeros(0, dtype=dtype)
@@ -140,7 +140,7 @@ class _Bytes:
 
 
 class _Numbers(_Bytes):
-    """The numbers of an ascii ply; each takes one unit."""
+    """The numbers of an ascii ply, each one unit long."""
 
     def __init__(self, text: bytes) -> None:
         self.units = parse_numbers(text, float)
@@ -156,7 +156,7 @@ class _Numbers(_Bytes):
 def _locate(
     path: Path, body: _Bytes, element: Element, start: int
 ) -> tuple[Int[np.ndarray, "n p"], Int[np.ndarray, "n p"], int]:
-    """Where each property of each row has its numbers, how many they are, and where the element ends."""
+    """Position and count of each property's numbers in each row, and the end of the element."""
     least = sum(body.size(p.dtype if p.count is None else p.count) for p in element.properties)
     if element.length < 0 or element.length * max(least, 1) > len(body) - start:
         raise _too_short(path, element)
@@ -193,7 +193,7 @@ def _measure_row(
 def _walk(
     path: Path, body: _Bytes, element: Element, start: int
 ) -> tuple[Int[np.ndarray, "n p"], Int[np.ndarray, "n p"], int]:
-    """As ``_locate``, row by row: lists differ in length."""
+    """As ``_locate``, but row by row, because lists differ in length."""
     shape = (element.length, len(element.properties))
     positions, counts = np.zeros(shape, np.int64), np.ones(shape, np.int64)
     units, at, end = body.units, start, len(body)

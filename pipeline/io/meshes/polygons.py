@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-_FLAT = 1e-6  # of a polygon's area: a triangle turned over by less is rounding
+_FLAT = 1e-6  # share of a polygon's area: smaller flipped triangles are rounding errors
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class Ragged:
 
 
 def triangulate(vertices: Float[np.ndarray, "v 3"], polygons: Ragged) -> tuple[Int[np.ndarray, "f 3"], bool]:
-    """Triangles as indices into ``polygons.values``: those of triangles first, then of quads, then of more corners.
+    """Triangles as indices into ``polygons.values``: first those of triangles, then of quads, then of larger polygons.
 
-    Polygons are cut as fans about their first corner; where a fan leaves a concave polygon, its ears are cut instead,
-    and the second value is True. Lists of fewer than three values are dropped.
+    Polygons are split into fans around their first corner; if a fan would leave a concave polygon, its ears are clipped
+    instead, and the second value is True. Lists of fewer than three values are dropped.
     """
     starts, triangles, cut = polygons.starts, [np.zeros((0, 3), np.int64)], False
     for count in np.unique(polygons.counts[polygons.counts >= 3]).tolist():
@@ -52,7 +52,7 @@ def triangulate(vertices: Float[np.ndarray, "v 3"], polygons: Ragged) -> tuple[I
 
 
 def _fan_fails(vertices: Float[np.ndarray, "v 3"], indices: Int[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
-    """Whether a triangle of the fan about the first corner faces away from the polygon."""
+    """Whether a triangle of the fan around the first corner is flipped."""
     fails = np.zeros(len(indices), dtype=bool)
     rows = max(1, (1 << 20) // indices.shape[1])
     for row in range(0, len(indices), rows):

@@ -1,4 +1,4 @@
-"""Mesh file -> the mesh that templates are rendered from: scaled, and simplified where that is asked for."""
+"""Mesh file -> the mesh that templates are rendered from: scaled and, if requested, simplified."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ NO_COLOURS = "it has no colours, so templates are grey and poses less accurate; 
 
 
 def prepare_mesh(path: Path, *, scale: float = 1.0, simplify: int | None = None) -> tuple[Mesh, MeshFacts]:
-    """The mesh of a file times ``scale``, with at most ``simplify`` faces (None: as many as it has), and its facts.
+    """The mesh of a file times ``scale``, with at most ``simplify`` faces (None: all), and its facts.
 
-    The diameter is that of the mesh before it is simplified. Raises BadInput as ``read_mesh`` does.
+    The diameter is measured before simplification. Raises BadInput as ``read_mesh`` does.
     """
     mesh = read_mesh(path)
     if scale != 1.0:
@@ -38,7 +38,7 @@ def prepare_mesh(path: Path, *, scale: float = 1.0, simplify: int | None = None)
 
 
 def prepared_digest(path: Path, *, scale: float = 1.0, simplify: int | None = None) -> str:
-    """Digest of what ``prepare_mesh`` returns, without making it. Raises BadInput."""
+    """Digest of the result of ``prepare_mesh``, without computing it. Raises BadInput."""
     identity = identify_mesh(path)
     return _derive_digest(identity.digest, identity.faces, scale, simplify)
 

@@ -1,4 +1,4 @@
-"""Mesh files -> meshes, by their formats' parsers; and digests of the files that a mesh is read from."""
+"""Mesh files -> meshes, by format; and digests of the files that a mesh is read from."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from pipeline.items.objects import Mesh
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 READER_VERSIONS = dict.fromkeys(SUFFIXES, 2) | {".ply": 1, ".stl": 1}
-"""Raise the number of a format when the same file gives another mesh. It is part of the mesh's digest from 2 on."""
-_REVISED = 2  # version of a ply or stl that version 1 would have read otherwise
+"""Raise a format's version if its reader returns another mesh for the same file. Part of the digest from 2 on."""
+_REVISED = 2  # version of a ply or stl that version 1 read differently
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -31,7 +31,7 @@ def read_mesh(path: Path) -> Mesh:
 
     A ply's vertices keep their order; a vertex with several texture coordinates or colours gets copies after the last
     vertex. obj files keep the vertices that faces use, copies included. Raises BadInput for a file, material or texture
-    that is missing or broken, for what is stated but cannot be read, and for a mesh without extent.
+    that is missing or broken, for unsupported contents, and for a mesh without extent.
     """
     path = _check_path(path)
     companions = Companions(path)
@@ -81,7 +81,7 @@ def _check_path(path: Path) -> Path:
 
 
 def _parse(path: Path, data: bytes, companions: Companions) -> tuple[Mesh, bool]:
-    """The mesh, and whether version 1 of a ply's or stl's reader would have made another one of it."""
+    """The mesh, and whether version 1 of the ply or stl reader returned another one."""
     suffix = path.suffix.lower()
     if suffix == ".ply":
         return parse_ply(path, data, companions)
@@ -94,7 +94,7 @@ def _parse(path: Path, data: bytes, companions: Companions) -> tuple[Mesh, bool]
 
 @contextmanager
 def _one_line(path: Path) -> Iterator[None]:
-    """Raise BadInput for whatever parsers raise on broken bytes, and disable trimesh's log, which prints tracebacks."""
+    """Turn parser errors on broken bytes into BadInput, and disable trimesh's log, which prints tracebacks."""
     logger = logging.getLogger("trimesh")
     before, logger.disabled = logger.disabled, True
     try:

@@ -15,15 +15,14 @@ from pipeline.io.meshes.bake import bake_texture
 from pipeline.items.objects import Mesh
 
 SIMPLIFY_VERSION = f"1, fast-simplification {version('fast-simplification')}"
-_MEASURED = 100_000  # points of each surface at which the distance to the other one is measured
-_WELD = 1e-7  # of the mesh's largest side: vertices this close are one, or seams would tear open
+_MEASURED = 100_000  # points per surface at which the distance to the other one is measured
+_WELD = 1e-7  # share of the mesh's largest side: closer vertices are merged, or seams would tear open
 
 
 def simplify_mesh(mesh: Mesh, faces: int, diameter_mm: float) -> tuple[Mesh, str]:
-    """A mesh of about ``faces`` faces at most, and what it lost, in one line.
+    """A mesh of about ``faces`` faces at most, and a line that says what was lost.
 
-    Edges are collapsed without regard to colours: what the surface shows, be it a texture or colours of vertices, is
-    baked into a new texture.
+    Edges are collapsed regardless of colours; texture or vertex colours are then baked into a new texture.
     """
     vertices, few = _collapse(mesh, faces)
     result = Mesh(vertices, few, digest=mesh.digest, warnings=mesh.warnings)
@@ -40,7 +39,7 @@ def simplify_mesh(mesh: Mesh, faces: int, diameter_mm: float) -> tuple[Mesh, str
 
 
 def _collapse(mesh: Mesh, faces: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and faces after collapsing edges, until there are no more than ``faces`` or no edge can go."""
+    """Vertices and faces after collapsing edges until at most ``faces`` are left or no edge can be collapsed."""
     import fast_simplification
 
     grid = np.rint(mesh.vertices / (_WELD * np.ptp(mesh.vertices, axis=0).max()))
@@ -50,7 +49,7 @@ def _collapse(mesh: Mesh, faces: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.
     welded = np.ascontiguousarray(welded[~degenerate], dtype=np.int32)
     if len(welded) <= faces:
         return mesh.vertices[first], welded.astype(np.int64)
-    for keep_border in (True, False):  # without it, corners of open sheets wear off
+    for keep_border in (True, False):  # otherwise, corners of open sheets wear off
         vertices, few = fast_simplification.simplify(
             mesh.vertices[first], welded, target_count=faces, preserve_border=keep_border
         )
@@ -71,9 +70,9 @@ def _measure_distance(first: Mesh, second: Mesh) -> float:
 
 
 def thin_mesh(mesh: Mesh, faces: int, *, texture_px: int) -> Mesh:
-    """A mesh to look at, quickly made: about ``faces`` faces at most, and a texture of at most ``texture_px`` a side.
+    """A quick preview: about ``faces`` faces at most, and a texture of at most ``texture_px`` a side.
 
-    A mesh of more faces has colours of vertices instead of its texture. Its geometry is not for estimating poses.
+    If faces are removed, vertex colours replace the texture. The geometry is too coarse for estimating poses.
     """
     if len(mesh.faces) <= faces:
         return mesh if mesh.texture is None else replace(mesh, texture=_shrink(mesh.texture, texture_px))

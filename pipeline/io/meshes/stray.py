@@ -1,4 +1,4 @@
-"""Faces that a scan left far from its object: they enlarge the diameter, and with it the distance of templates."""
+"""Stray faces of a scan, far from the object: they enlarge the diameter, and with it the distance of templates."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from jaxtyping import Bool, Float
 from pipeline.functional.surface import face_areas
 from pipeline.items.objects import Mesh
 
-_SHARE = 0.003  # of the surface that may be stray, at either end of each axis
-_ENLARGED = 1.25  # diagonal of the bounding box with stray faces, times that of the box without
-_MARGIN = 0.1  # of the diagonal around most of the surface: faces this near to it are not stray
+_SHARE = 0.003  # share of the surface that may be stray, at either end of each axis
+_ENLARGED = 1.25  # minimum ratio of the bounding box's diagonals with and without stray faces
+_MARGIN = 0.1  # share of that diagonal: faces closer to most of the surface are not stray
 _BINS = 4096
 
 
 def describe_stray_faces(mesh: Mesh) -> tuple[str, ...]:
-    """One line if a small share of the surface lies so far from the rest that it enlarges the mesh by a quarter."""
+    """A warning if a small part of the surface is so far from the rest that it enlarges the mesh by a quarter."""
     areas = face_areas(mesh.vertices, mesh.faces)
     if not areas.sum() > 0:
         return ()
@@ -35,7 +35,7 @@ def describe_stray_faces(mesh: Mesh) -> tuple[str, ...]:
 
 
 def _in_core(places: Float[np.ndarray, " f"], areas: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Whether faces lie between the ends of an axis beyond which there is less than the stray share of the surface."""
+    """Whether faces lie between those ends of an axis that hold less than the stray share of the surface."""
     total, edges = np.histogram(places, bins=_BINS, weights=areas)
     below = np.cumsum(total) / total.sum()
     first, last = np.searchsorted(below, [_SHARE, 1 - _SHARE])

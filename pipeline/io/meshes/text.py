@@ -1,4 +1,4 @@
-"""Columns of numbers as text -> arrays."""
+"""Numbers in text -> arrays."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def parse_numbers(text: bytes, dtype: type) -> np.ndarray:
-    """The numbers in a text, a hundred times faster than word by word; too few of them where a word is no number."""
+    """The numbers in a text, a hundred times faster than word by word. Stops at the first word that is no number."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # numpy before 2.4 returns the numbers up to that word
         try:
