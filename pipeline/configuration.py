@@ -74,8 +74,8 @@ def drop_replaced_fields(values: Mapping[str, Any]) -> dict[str, Any]:
 
     With ``solve=epnp``, say, ``method=dzop_x`` sets ``solve.refit_px``, which only its own solver has.
     """
-    kept, path = dict(values), CONF / "method" / f"{values.get('method')}.yaml"
-    by_method = _read_yaml(path) if path.is_file() else {}
+    kept, path = dict(values), _find_yaml("method", values.get("method"))
+    by_method = {} if path is None else _read_yaml(path)
     for stage in STAGES:
         given, variant = by_method.get(stage), values.get(stage)
         if not isinstance(given, dict) or not isinstance(variant, Mapping):
@@ -92,8 +92,24 @@ def _target_of_method(by_method: Mapping[str, Any], stage: str) -> Any:
     defaults = [entry for entry in _read_yaml(CONF / "config.yaml")["defaults"] if isinstance(entry, dict)]
     chosen = {name: value for entry in defaults for name, value in entry.items()}
     for entry in by_method.get("defaults", ()):
-        chosen |= {name.removeprefix("override /"): value for name, value in entry.items()}
-    return _read_yaml(CONF / stage / f"{chosen[stage]}.yaml").get("_target_")
+        if isinstance(entry, dict):
+            chosen |= {name.removeprefix("override /"): value for name, value in entry.items()}
+    path = _find_yaml(stage, chosen[stage])
+    return None if path is None else _read_yaml(path).get("_target_")
+
+
+def _find_yaml(group: str, name: Any) -> Path | None:
+    """The yaml of a method or variant, in conf/ or else in the folder of --config-dir; None if there is none."""
+    paths = (folder / group / f"{name}.yaml" for folder in (CONF, *_own_folders()))
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _own_folders() -> list[Path]:
+    """The folder that --config-dir names, if any."""
+    if not HydraConfig.initialized():
+        return []
+    sources = HydraConfig.get().runtime.config_sources
+    return [Path(source.path) for source in sources if source.provider == "command-line"]
 
 
 @cache
@@ -179,11 +195,7 @@ def _may_import_others() -> bool:
     Importing runs code, so it takes a folder of the user's own yamls (--config-dir) and no ``_target_`` among the
     overrides.
     """
-    if not HydraConfig.initialized():
-        return False
-    hydra = HydraConfig.get()
-    has_config_dir = any(source.provider == "command-line" for source in hydra.runtime.config_sources)
-    return has_config_dir and not any("_target_" in override for override in hydra.overrides.task)
+    return bool(_own_folders()) and not any("_target_" in line for line in HydraConfig.get().overrides.task)
 
 
 def suggest_field(name: str) -> str:

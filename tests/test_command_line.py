@@ -397,6 +397,24 @@ def test_an_own_variant_may_not_have_a_kind_of_the_package(dzop, tmp_path, monke
     assert "error: own.cosine.First.kind: found 'match.cosine', which is the package's" in ran.err
 
 
+METHOD = """# @package _global_
+defaults:
+  - override /solve: poselib
+  - _self_
+
+method: own
+solve:
+  refit_px: 2.0
+"""
+
+
+def test_a_chosen_variant_loses_the_fields_of_an_own_method_for_another_one(dzop, tmp_path):
+    (tmp_path / "conf" / "method").mkdir(parents=True)
+    (tmp_path / "conf" / "method" / "own.yaml").write_text(METHOD)
+    ran = dzop("--config-dir", str(tmp_path / "conf"), "method=own", "solve=epnp", "plan=true")
+    assert ran.status == 0, ran.err
+
+
 def test_a_matcher_is_one_file_and_one_yaml(dzop, tmp_path, monkeypatch, cache):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "first.py").write_text(MATCHER)
