@@ -120,8 +120,8 @@ class Route:
         """
         if first.solution is None:
             return first
-        with self.clock("draw"):
-            view = self.bank.draw(first.solution.T_cam_obj, self.query.A_crop_img, self.query.K)
+        with self.clock("rerender"):
+            view = self.bank.render(first.solution.T_cam_obj, self.query.A_crop_img, self.query.K)
         start = Hypothesis(first.template_id, first.template_score, rerendered=view, first=first)
         second = self.solve(self.compare(start))
         return first if second.solution is None else second

@@ -25,7 +25,7 @@ def array_bank(
     Fits are computed when asked for.
     """
 
-    def draw(*_) -> TemplateView:
+    def render(*_) -> TemplateView:
         raise AssertionError("this bank cannot render")
 
     return StoredBank(
@@ -33,7 +33,7 @@ def array_bank(
         maps=maps or (lambda layer: features),
         masks=lambda: mask,
         view=lambda index: views[index],
-        draw=draw,
+        render=render,
         poses=lambda: T_cam_obj,
         fitted=lambda fit: dict(fit_arrays(fit, foreground_cells(features, mask))),
     )

@@ -75,7 +75,7 @@ def test_a_drawn_view_shows_the_object_where_the_querys_crop_would(scenes, cache
     size = crop.size
     square = camera.square_crop(box, size=size, padding_ratio=1.2)
     A = square if isinstance(crop, Square) else camera.virtual_crop(box, K, size=size, padding_ratio=1.2)
-    drawn = made.templates.bank(gt.obj_id).draw(gt.T_cam_obj, A, K)
+    drawn = made.templates.bank(gt.obj_id).render(gt.T_cam_obj, A, K)
     assert drawn.rgb.shape == (size, size, 3)
     assert drawn.rgb[drawn.crop.mask.numpy()].any(axis=1).mean() > 0.95
     assert {layer: tuple(maps.shape) for layer, maps in drawn.crop.maps.items()} == {
@@ -100,7 +100,7 @@ def test_a_second_look_brings_poses_nearer_and_is_traced_again_as_it_was(scenes,
             points = made.context.model(answer.obj_id).mesh.vertices
             moved = rigid.transform(answer.T_cam_obj, points) - rigid.transform(true.T_cam_obj, points)
             off.append(np.linalg.norm(moved, axis=1).mean() / np.ptp(points, axis=0).max())
-            assert ("draw" in answer.times_s) == (looks > 0)
+            assert ("rerender" in answer.times_s) == (looks > 0)
         errors[looks] = float(np.median(off))
         traced = made.replayer()(answers[0])
         assert traced is not None
@@ -121,9 +121,9 @@ def test_where_the_drawn_view_shows_nothing_the_first_look_answers(scenes, cache
     made.queries.make_features(scenes.images[0], found)
     query, bank = made.poses.query(found[0])[0], made.templates.bank(found[0].detection.obj_id)
     behind = rigid.rigid(np.eye(3), np.array([0.0, 0.0, -500.0]))
-    nothing = bank.draw(behind, query.A_crop_img, query.K)
+    nothing = bank.render(behind, query.A_crop_img, query.K)
     assert not nothing.crop.mask.any()
-    kept = trace_pose(made.context.stages, query, replace(bank, draw=lambda *pose: nothing)).best
+    kept = trace_pose(made.context.stages, query, replace(bank, render=lambda *pose: nothing)).best
     first = trace_pose(replace(made.context.stages, second_look=SecondLook()), query, bank).best
     assert kept.rerendered is None
     np.testing.assert_array_equal(kept.solution.T_cam_obj, first.solution.T_cam_obj)

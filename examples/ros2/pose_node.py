@@ -58,7 +58,7 @@ class PoseNode(Node):
         message = Detection3DArray(header=image.header)
         if not result.found:
             self.get_logger().warning(result.summary())
-        elif sureness(result) >= self._value("min_score"):
+        elif best_score(result) >= self._value("min_score"):
             message.detections.append(self.to_detection(result, image))
             self.tf.sendTransform(to_transform(result, image))
         self.detections.publish(message)
@@ -66,7 +66,7 @@ class PoseNode(Node):
     def to_detection(self, result: PoseResult, image: Image) -> Detection3D:
         """A detection with the pose of the object's origin, and the mesh's bounding box."""
         hypothesis = ObjectHypothesisWithPose()
-        hypothesis.hypothesis.class_id, hypothesis.hypothesis.score = result.name, sureness(result)
+        hypothesis.hypothesis.class_id, hypothesis.hypothesis.score = result.name, best_score(result)
         set_pose(hypothesis.pose.pose, result)
         detection = Detection3D(header=image.header)
         detection.results.append(hypothesis)
@@ -77,7 +77,7 @@ class PoseNode(Node):
         return detection
 
 
-def sureness(result: PoseResult) -> float:
+def best_score(result: PoseResult) -> float:
     """The confidence, or the score if there is no calibration."""
     return float(result.score if result.confidence is None else result.confidence)
 

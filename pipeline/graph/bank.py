@@ -28,7 +28,7 @@ class StoredBank:
     maps: Callable[[int], torch.Tensor]
     masks: Callable[[], torch.Tensor]
     view: Callable[[int], TemplateView]
-    draw: Callable[[Pose, Matrix, Matrix], TemplateView]
+    render: Callable[[Pose, Matrix, Matrix], TemplateView]
     poses: Callable[[], np.ndarray]
     fitted: Callable[[Fit], FittedArrays]
 

@@ -311,7 +311,7 @@ class TemplateNodes:
             maps=maps,
             masks=lambda: self.context.tensor(crops.array("mask")),
             view=view,
-            draw=partial(self._render_view, obj_id),
+            render=partial(self._render_view, obj_id),
             poses=lambda: templates.array("T_cam_obj"),
             fitted=fitted,
         )

@@ -141,7 +141,7 @@ class TemplateBank(Protocol):
         """One template in full."""
         ...
 
-    def draw(
+    def render(
         self,
         T_cam_obj: Float[np.ndarray, "4 4"],
         A_crop_img: Float[np.ndarray, "3 3"],
