@@ -144,7 +144,7 @@ class PoseEstimator:
             graph.check()
             graph.limit_vram()
             graph.onboard()
-            _ = context.backbone, [graph.templates.extent(obj_id) for obj_id in context.object_ids]
+            _ = context.backbone, [graph.templates.extents.read(obj_id) for obj_id in context.object_ids]
         return graph
 
     def _frame(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> Frame:

@@ -80,6 +80,8 @@ class Plan:
         yield self._node("templates", of, self.templates.templates(obj_id), nbytes, f"{n} views", timing, n)
         nbytes, timing = _total_bytes(self.context.crops_layout(), n), timing_key("template crops", stages)
         yield self._node("template crops", of, self.templates.crops(obj_id), nbytes, f"{n} crops", timing, n)
+        if (extent := self.templates.extents.ref(obj_id)) is not None:
+            yield self._node("symmetries", of, extent, None, "1 mesh")
 
     def _template_feature_nodes(self, obj_id: int) -> Iterator[Node]:
         n, of, stages = self._count_views(obj_id), f"object {obj_id}", self.context.stages

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -37,6 +37,7 @@ from pipeline.stages.render.raycast import render_depth
 from pipeline.store import Ref, make_ref
 
 POSES_VERSION = 4
+KEPT = 8  # detections whose best hypothesis stays in memory, for the picture of how its pose was found
 
 
 @dataclass(eq=False)
@@ -46,6 +47,7 @@ class PoseNodes:
     context: Context
     templates: TemplateNodes
     queries: QueryNodes
+    _kept: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def groups(self) -> dict[tuple[int, int], list[Target]]:
@@ -179,11 +181,24 @@ class PoseNodes:
                 raise NoPose("crop", self.queries.crop_failure(index, d))
             query, shared_s = self.query(found)
             trace = trace_guesses(self.context.stages, query, bank)
-            query = trace.query or query
+            self._keep(index, trace)
             template_id = trace.best.template_id
-            return self._estimate(nth, d, query, trace, bank, shared_s)
+            return self._estimate(nth, d, trace.query or query, trace, bank, shared_s)
         except NoPose as failure:
             return NoEstimate(d.scene_id, d.im_id, d.obj_id, failure.stage, failure.reason, nth, d.gt_id, template_id)
+
+    def _keep(self, index: int, trace: Trace) -> None:
+        self._kept[index] = replace(trace, hypotheses=trace.hypotheses[:1])
+        while len(self._kept) > KEPT:
+            del self._kept[next(iter(self._kept))]
+
+    def retrace(self, found: CroppedDetection, bank: StoredBank) -> Trace:
+        """How the pose of a detection was found: from memory for the last few, otherwise computed once more.
+
+        From memory, there is no other hypothesis than the best.
+        """
+        kept = self._kept.get(found.index)
+        return kept or trace_guesses(self.context.stages, self.query(found)[0], bank)
 
     def query(self, found: CroppedDetection) -> tuple[Query, dict[str, float]]:
         """A detection as input of the online route (with ground truth for oracles only), and its seconds."""
@@ -267,10 +282,10 @@ class PoseNodes:
             return {}, ()
         route = Route(self.context.stages, query, bank)
         geometry = route.geometry(route.view(trace.best), trace.best.pair)
-        return collect_evidence(trace, query, geometry, self.templates.extent(obj_id))
+        return collect_evidence(trace, query, geometry, self.templates.extents.read(obj_id))
 
     def _canonical(self, T_cam_obj: Float[np.ndarray, "4 4"], obj_id: int) -> Float[np.ndarray, "4 4"]:
         """The pose, or the canonical one of its symmetric copies if symmetries were detected on the mesh."""
         if not self.context.dataset.finds_symmetries:
             return T_cam_obj
-        return make_canonical(T_cam_obj, self.templates.extent(obj_id).symmetries)
+        return make_canonical(T_cam_obj, self.templates.extents.read(obj_id).symmetries)

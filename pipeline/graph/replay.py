@@ -10,7 +10,6 @@ from jaxtyping import UInt8
 from pipeline.graph.poses import PoseNodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.templates import TemplateNodes
-from pipeline.guesses import trace_guesses
 from pipeline.items.online import Hypothesis
 from pipeline.items.records import Answer
 from pipeline.items.views import Detection
@@ -29,7 +28,7 @@ class Replay:
 
 @dataclass(eq=False)
 class Replayer:
-    """Repeats the online route of answers of one run."""
+    """Repeats the online route of answers of one run; the last ones are still in memory."""
 
     templates: TemplateNodes
     queries: QueryNodes
@@ -48,8 +47,7 @@ class Replayer:
         query_rgb = context.store.read(self.queries.crops(image)).array("rgb", [found.row])[0]
         if answer.template_id is None:
             return Replay(detection, query_rgb)
-        bank, query = self.templates.bank(answer.obj_id), self.poses.query(found)[0]
-        trace = trace_guesses(context.stages, query, bank)
+        trace = self.poses.retrace(found, self.templates.bank(answer.obj_id))
         hypothesis = trace.best
         if trace.query is not None and trace.query.rgb is not None:
             query_rgb = trace.query.rgb

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline.bop.symmetries import mesh_symmetries, transforms_of
-from pipeline.confidence.evidence import Extent, measure_extent
 from pipeline.errors import DzopError
 from pipeline.fits import chain, foreground_cells
 from pipeline.functional.camera import crop_camera, resize_affine
@@ -20,6 +18,7 @@ from pipeline.functional.resample import resample
 from pipeline.functional.rigid import rigid
 from pipeline.graph.bank import Matrix, Pose, StoredBank
 from pipeline.graph.context import Context, stack_crops, to_half
+from pipeline.graph.extents import ExtentNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
 from pipeline.items.features import CropFeatures, FittedArrays, TemplateCells
@@ -48,6 +47,11 @@ class TemplateNodes:
     context: Context
     views: int = 64
     banks: int = 1
+
+    @cached_property
+    def extents(self) -> ExtentNodes:
+        """Extents of the objects, with their symmetries."""
+        return ExtentNodes(self.context)
 
     @cached_property
     def templates(self) -> Callable[[int], Ref]:
@@ -261,11 +265,12 @@ class TemplateNodes:
         refs = [self.templates(obj_id), self.crops(obj_id)]
         refs += [self.features(obj_id, layer) for layer in self.context.stages.layers]
         refs += [self.fitted(obj_id, fit) for fit in self.context.stages.fits]
-        refs += [ref for ref in [self.encodings(obj_id)] if ref is not None]
+        refs += [ref for ref in (self.encodings(obj_id), self.extents.ref(obj_id)) if ref is not None]
         return all(map(self.context.store.is_complete, refs))
 
     def _onboard(self, obj_id: int, advance: Advance) -> None:
         count = self.make_templates(obj_id)
+        self.extents.make(obj_id)
         self.context.models.discard(obj_id)  # also frees the renderer's data, three times the size of the mesh
         self.make_crops(obj_id, count)
         self.make_features(obj_id, count, self.context.stages.layers)
@@ -315,17 +320,6 @@ class TemplateNodes:
             poses=lambda: templates.array("T_cam_obj"),
             fitted=fitted,
         )
-
-    @cached_property
-    def extent(self) -> Callable[[int], Extent]:
-        """Extent of an object, for distances between its poses."""
-        return lru_cache(maxsize=None)(self._measure_extent)
-
-    def _measure_extent(self, obj_id: int) -> Extent:
-        model = self.context.model(obj_id)
-        if self.context.dataset.finds_symmetries:
-            model = replace(model, symmetries=transforms_of(mesh_symmetries(model.mesh, model.diameter_mm)[1]))
-        return measure_extent(model)
 
     def _open(self, obj_id: int) -> tuple[dict[int, Entry], Entry, Entry]:
         """Entries of an object: features by layer, crops and templates."""

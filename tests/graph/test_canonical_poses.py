@@ -24,7 +24,7 @@ def test_symmetric_copies_of_an_own_object_have_one_pose(tmp_path):
         again = poses._canonical(T @ copy, 1)
         assert rotation_angle_deg(again[:3, :3], once[:3, :3]) < 3
         assert np.linalg.norm(again[:3, 3] - once[:3, 3]) < 1.5
-    assert len(poses.templates.extent(1).symmetries) == 2 * 315
+    assert len(poses.templates.extents.read(1).symmetries) == 2 * 315
 
 
 def test_poses_of_a_dataset_stay_as_they_were_estimated(tmp_path):
