@@ -27,6 +27,7 @@ from benchmarks.online import online
 from benchmarks.rendering import rendering
 from benchmarks.startup import startup
 from benchmarks.storing import storing
+from benchmarks.video import video
 from benchmarks.workers import two_workers
 from pipeline.errors import DzopError
 from pipeline.io.files import write_json
@@ -40,6 +41,7 @@ PARTS: dict[str, Callable[..., list[Measurement]]] = {
     "extract": extraction,
     "jobs": warm,
     "startup": startup,
+    "video": video,
     "onboard": onboarding,
     "memory": memory,
     "imports": imports,

@@ -19,11 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bop.frame import Frame, parse_depth, parse_image, parse_locations
+from pipeline.bop.frame import Frame, parse_depth, parse_image, parse_locations, parse_prior
 from pipeline.bop.given import MeshFiles, check_own_camera, parse_K
 from pipeline.confidence.calibration import choose_calibration
 from pipeline.configuration import build_options, build_stages, build_variant, compose_settings
 from pipeline.errors import BadInput
+from pipeline.functional.camera import project
+from pipeline.functional.rigid import transform
 from pipeline.graph import Context, Graph
 from pipeline.io.digests import DigestCache, track_files
 from pipeline.items.views import Target
@@ -34,6 +36,7 @@ from pipeline.store import MemoryStoreConfig, Store
 
 Mesh = str | PathLike[str]
 SCENE_ID, IM_ID = 0, 0
+MARGIN = 0.15  # by which the box around a prior is larger than the object, so that it may have moved
 MAX_BANKS = 8  # most objects whose templates stay in memory
 PLACEHOLDERS = ("dataset=photo", "dataset.mesh=mesh", "dataset.image=image", "dataset.K=[1,1,1,1]")
 
@@ -77,30 +80,45 @@ class PoseEstimator:
         bbox: Sequence[float] | None = None,
         name: str | None = None,
         depth_mm: np.ndarray | None = None,
+        prior: PoseResult | np.ndarray | None = None,
     ) -> PoseResult:
         """The pose of one object in an image.
 
         ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. Either ``mask``: h x w, 0
         outside the object, or ``bbox``: x, y, width, height. ``name``: the object, if the estimator has several.
-        ``depth_mm``: h x w, registered to the image, 0 where unknown; the pose is fitted to it.
+        ``depth_mm``: h x w, registered to the image, 0 where unknown; the pose is fitted to it. ``prior``: the result
+        of the frame before, or its T_cam_obj (4 x 4, mm). It is followed if the image confirms it, which is faster;
+        otherwise all templates are searched. With a prior, mask and bbox may be missing: the object is then sought in
+        the box around the prior.
         """
+        if name is None and len(self.names) > 1:
+            raise BadInput("name", found="nothing", needed=f"one of {', '.join(self.names)}")
+        asked, rgb = self.names[0] if name is None else name, parse_image(rgb)
+        if mask is None and bbox is None and (T_cam_obj := _prior_pose(prior)) is not None:
+            bbox = self._box_around(asked, T_cam_obj, K, (rgb.shape[0], rgb.shape[1]))
         if (mask is None) == (bbox is None):
             found = "neither" if mask is None else "both"
             raise BadInput("mask, bbox", found=found, needed="one of them, which says where the object is")
-        if name is None and len(self.names) > 1:
-            raise BadInput("name", found="nothing", needed=f"one of {', '.join(self.names)}")
         given = bbox if mask is None else np.asarray(mask)
-        return self.find(rgb, K, {self.names[0] if name is None else name: given}, depth_mm=depth_mm)[0]
+        return self.find(rgb, K, {asked: given}, depth_mm=depth_mm, priors={asked: [prior]})[0]
 
     def find(
-        self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any], *, depth_mm: np.ndarray | None = None
+        self,
+        rgb: np.ndarray,
+        K: Any,
+        locations: Mapping[str, Any],
+        *,
+        depth_mm: np.ndarray | None = None,
+        priors: Mapping[str, Sequence[PoseResult | np.ndarray | None]] | None = None,
     ) -> tuple[PoseResult, ...]:
         """The poses of several objects or instances in one image, in the order of ``locations``.
 
         ``locations``: object name -> mask, box [x, y, width, height], or a list of these for several instances.
-        ``depth_mm``: as in ``__call__``.
+        ``depth_mm``: as in ``__call__``. ``priors``: object name -> one prior per instance, as in ``__call__``.
         """
         frame = self._frame(parse_image(rgb), K, locations)
+        if priors is not None:
+            frame = replace(frame, priors=self._priors(priors))
         if depth_mm is not None:
             frame = replace(frame, depth=parse_depth(depth_mm, (frame.rgb.shape[0], frame.rgb.shape[1])))
         with self._lock:
@@ -147,23 +165,43 @@ class PoseEstimator:
             _ = context.backbone, [graph.templates.extents.read(obj_id) for obj_id in context.object_ids]
         return graph
 
-    def _frame(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> Frame:
-        unknown = [name for name in locations if name not in self.names]
-        if unknown or not locations:
+    def _check_names(self, names: Sequence[str]) -> None:
+        unknown = [name for name in names if name not in self.names]
+        if unknown or not names:
             found = repr(unknown[0]) if unknown else "no object"
             raise BadInput("name", found=found, needed=f"one of {', '.join(self.names)}")
+
+    def _frame(self, rgb: np.ndarray, K: Any, locations: Mapping[str, Any]) -> Frame:
+        self._check_names(list(locations))
         size_hw = (rgb.shape[0], rgb.shape[1])
-        try:
-            numbers = np.asarray(K, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise BadInput("K", found=repr(K)[:60], needed="[fx,fy,cx,cy] or a 3 x 3 matrix") from None
-        camera_matrix = parse_K(np.atleast_1d(numbers).tolist(), "K")
-        check_own_camera(camera_matrix, size_hw, "K")
+        camera_matrix = _parse_camera(K, size_hw)
         located = {self.names.index(name) + 1: parse_locations(given, size_hw) for name, given in locations.items()}
         targets = tuple(Target(SCENE_ID, IM_ID, obj_id, len(at)) for obj_id, at in sorted(located.items()))
         dataset = self._graph.context.dataset
         assert isinstance(dataset, Frame)
         return replace(dataset, targets=targets, rgb=rgb, camera_matrix=camera_matrix, locations=located)
+
+    def _priors(self, given: Mapping[str, Sequence[Any]]) -> dict[int, list[np.ndarray | None]]:
+        self._check_names(list(given))
+        priors = {self.names.index(name) + 1: [_prior_pose(one) for one in ones] for name, ones in given.items()}
+        has_prior = any(T_cam_obj is not None for ones in priors.values() for T_cam_obj in ones)
+        if has_prior and not self._graph.context.stages.second_look.hypotheses:
+            needed = "method=dzop_x or second_look=drawn, which render the object in a pose"
+            raise BadInput("prior", found="with second_look=none", needed=needed)
+        return priors
+
+    def _box_around(self, name: str, T_cam_obj: np.ndarray, K: Any, size_hw: tuple[int, int]) -> list[float]:
+        """The box [x, y, width, height] around an object in its expected pose, grown by MARGIN of its longer side."""
+        self._check_names([name])
+        camera_matrix, (h, w) = _parse_camera(K, size_hw), size_hw
+        points_obj = self._graph.templates.extents.read(self.names.index(name) + 1).points
+        px = project(camera_matrix, transform(T_cam_obj, points_obj))
+        low, high = px.min(axis=0), px.max(axis=0)
+        grown = MARGIN * float((high - low).max())
+        low, high = np.maximum(low - grown, 0), np.minimum(high + grown, (w, h))
+        if (high <= low).any():
+            raise BadInput("prior", found="a pose outside the image", needed="mask or bbox, or no prior")
+        return [*low.tolist(), *(high - low).tolist()]
 
     def _estimate(self, frame: Frame, names: Sequence[str]) -> tuple[PoseResult, ...]:
         context = self._graph.context.with_images(frame, Store(MemoryStoreConfig()))
@@ -179,3 +217,21 @@ class PoseEstimator:
 
 def _make_frame(meshes: MeshFiles, targets: tuple[Target, ...]) -> Frame:
     return Frame("frame", Path(), "test", "", {}, targets, meshes=meshes, simplify=meshes.simplify)
+
+
+def _parse_camera(K: Any, size_hw: tuple[int, int]) -> np.ndarray:
+    """The camera matrix (3 3), px. Raises BadInput."""
+    try:
+        numbers = np.asarray(K, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise BadInput("K", found=repr(K)[:60], needed="[fx,fy,cx,cy] or a 3 x 3 matrix") from None
+    camera_matrix = parse_K(np.atleast_1d(numbers).tolist(), "K")
+    check_own_camera(camera_matrix, size_hw, "K")
+    return camera_matrix
+
+
+def _prior_pose(given: Any) -> np.ndarray | None:
+    """T_cam_obj (4 4), mm, of a result or a matrix; None for a result without a pose, or one to reject."""
+    if isinstance(given, PoseResult):
+        given = None if given.decision == "reject" else given.T_cam_obj
+    return None if given is None else parse_prior(given)

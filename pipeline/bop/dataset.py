@@ -120,6 +120,15 @@ class Dataset:
         return False
 
     @property
+    def is_video(self) -> bool:
+        """Whether the images are frames in order, so that the pose in one is expected to be near that in the next."""
+        return False
+
+    def prior(self, obj_id: int, detection_id: int) -> Float[np.ndarray, "4 4"] | None:
+        """The pose T_cam_obj (mm) that the user expects of a detection; None where nothing is known."""
+        return None
+
+    @property
     def finds_symmetries(self) -> bool:
         """Whether symmetries have to be detected on the meshes because no file lists them."""
         return False

@@ -25,12 +25,21 @@ Location = Bool[np.ndarray, "H W"] | Box
 
 @dataclass(frozen=True, eq=False)
 class Frame(GivenObjects):
-    """A dataset of one image in memory. ``locations``: obj_id -> one mask or box per instance."""
+    """A dataset of one image in memory. ``locations``: obj_id -> one mask or box per instance.
+
+    ``priors``: obj_id -> the expected pose T_cam_obj (mm) of each instance, or None.
+    """
 
     rgb: UInt8[np.ndarray, "H W 3"] = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
     camera_matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     locations: Mapping[int, Sequence[Location]] = field(default_factory=dict)
     depth: Float32[np.ndarray, "H W"] | None = None
+    priors: Mapping[int, Sequence[Float[np.ndarray, "4 4"] | None]] = field(default_factory=dict)
+
+    def prior(self, obj_id: int, detection_id: int) -> Float[np.ndarray, "4 4"] | None:
+        """The expected pose of an instance."""
+        given = self.priors.get(obj_id, ())
+        return given[detection_id] if detection_id < len(given) else None
 
     @property
     def gives_depth(self) -> bool:
@@ -109,6 +118,22 @@ def parse_depth(depth_mm: np.ndarray, size_hw: tuple[int, int]) -> Float32[np.nd
     if depth.min(initial=0) < 0:
         raise BadInput("depth_mm", found="negative values", needed="millimetres along the optical axis, 0 for unknown")
     return depth
+
+
+def parse_prior(given: Any, where: str = "prior") -> Float[np.ndarray, "4 4"]:
+    """An expected pose T_cam_obj, mm. Raises BadInput for what is no rigid transform to a place before the camera."""
+    try:
+        T = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        T = np.zeros(0)
+    needed = "T_cam_obj, 4 x 4 in mm, such as result.T_cam_obj"
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise BadInput(where, found=f"shape {T.shape}" if T.size else repr(given)[:60], needed=needed)
+    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0:
+        raise BadInput(where, found="a matrix that is no rotation", needed=needed)
+    if T[2, 3] <= 0:
+        raise BadInput(where, found=f"z {T[2, 3]:.4g} mm, behind the camera", needed=needed)
+    return T
 
 
 def parse_locations(given: Any, size_hw: tuple[int, int]) -> tuple[Location, ...]:

@@ -54,7 +54,8 @@ class PhotoConfig(Spec):
     width, height in pixels. ``scale`` multiplies the mesh's vertices, whose unit is ``units``. ``distortion``: k1, k2,
     p1, p2[, k3[, k4, k5, k6]] of OpenCV's model; photographs, masks and the box are undistorted before anything else.
     ``simplify``: maximum number of faces of a mesh, None for all. ``depth``: depth image of the photograph's size;
-    ``depth_scale``: mm per unit.
+    ``depth_scale``: mm per unit. ``video``: the photographs are frames, sorted by name; each pose starts from the one
+    before.
     """
 
     kind: ClassVar[str] = "dataset.photo"
@@ -71,6 +72,7 @@ class PhotoConfig(Spec):
     simplify: FaceCount | None = None
     depth: str | None = None
     depth_scale: PositiveFloat = 1.0
+    video: bool = False
     name: str = "photo"
 
     def open(self) -> Photo:
@@ -112,6 +114,7 @@ class PhotoConfig(Spec):
             simplify=self.simplify,
             depth_file=None if self.depth is None else Path(self.depth).expanduser(),
             depth_scale=self.depth_scale,
+            is_video=self.video,
         )
 
     def _camera(self, photo: Path, size_hw: tuple[int, int]) -> CameraFile:
@@ -214,6 +217,7 @@ class Photo(GivenObjects):
     lens: Lens | None = None
     depth_file: Path | None = None
     depth_scale: float = 1.0
+    is_video: bool = False
 
     @property
     def gives_depth(self) -> bool:

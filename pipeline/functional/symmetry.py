@@ -27,6 +27,7 @@ _SAME_DEG = 20.0  # 8-fold symmetries are 45 degrees apart
 _TRIED_DEG = 9.0
 _EQUAL_MOMENTS = 0.12
 _MOST = 60
+IDENTITY = np.eye(4)
 _ROUNDS = 8
 
 
@@ -243,9 +244,12 @@ def _as_symmetries(
 
 
 def make_canonical(
-    T_cam_obj: Float[np.ndarray, "4 4"], symmetries: Float[np.ndarray, "s 4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    symmetries: Float[np.ndarray, "s 4 4"],
+    *,
+    near: Float[np.ndarray, "4 4"] = IDENTITY,
 ) -> Float[np.ndarray, "4 4"]:
-    """The symmetric copy whose rotation is nearest the identity, so that one image gives one pose."""
+    """The symmetric copy whose rotation is nearest that of ``near``, so that one image gives one pose."""
     copies = T_cam_obj @ symmetries
-    turned = np.trace(copies[:, :3, :3], axis1=1, axis2=2)
-    return np.asarray(copies[int(turned.argmax())])
+    likeness = np.einsum("sij,ij->s", copies[:, :3, :3], near[:3, :3])
+    return np.asarray(copies[int(likeness.argmax())])

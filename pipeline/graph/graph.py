@@ -46,6 +46,7 @@ class Graph:
         _ = runtime.memory_bytes, runtime.vram_bytes  # these raise BadInput for text that is no size
         stages.fuse.check(stages.extract)
         check_layers(stages)
+        self.poses.priors.check()
         if self.detections.proposals:
             if where := self.context.dataset.location_field:
                 raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")

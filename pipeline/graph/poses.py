@@ -20,13 +20,13 @@ from pipeline.functional.depth_fit import fit_depth
 from pipeline.functional.symmetry import make_canonical
 from pipeline.graph.bank import StoredBank
 from pipeline.graph.context import Context, ImageId
+from pipeline.graph.priors import Priors
 from pipeline.graph.queries import CroppedDetection, QueryNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.templates import TemplateNodes
 from pipeline.graph.timings import timing_key
-from pipeline.guesses import trace_guesses
 from pipeline.hypotheses import template_pose
-from pipeline.items.online import Query, Trace, Truth
+from pipeline.items.online import Prior, Query, Trace, Truth
 from pipeline.items.poses import Alternative, NoEstimate, PoseEstimate
 from pipeline.items.records import Answer, answer_from_record, answer_to_record
 from pipeline.items.views import Detection, Target
@@ -35,6 +35,7 @@ from pipeline.route import Route
 from pipeline.spec import digest
 from pipeline.stages.render.raycast import render_depth
 from pipeline.store import Ref, make_ref
+from pipeline.tracking import trace_detection
 
 POSES_VERSION = 4
 KEPT = 8  # detections whose best hypothesis stays in memory, for the picture of how its pose was found
@@ -48,6 +49,11 @@ class PoseNodes:
     templates: TemplateNodes
     queries: QueryNodes
     _kept: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def priors(self) -> Priors:
+        """Expected poses."""
+        return Priors(self.context, self.templates.extents)
 
     @cached_property
     def groups(self) -> dict[tuple[int, int], list[Target]]:
@@ -72,6 +78,7 @@ class PoseNodes:
             recipe["depth"] = stages.depth.recipe()
         if stages.segments:
             recipe["segment"] = stages.segment.recipe()
+        recipe |= self.priors.recipe(self.groups[group])
         inputs = {"templates": self.templates.templates(obj_id).key, "template crops": self.templates.crops(obj_id).key}
         for layer in stages.layers:
             inputs[f"template layer {layer}"] = self.templates.features(obj_id, layer).key
@@ -148,9 +155,10 @@ class PoseNodes:
     def _solve(self, group: tuple[int, int], advance: Advance) -> None:
         ref, (_, obj_id) = self.poses(group), group
         bank, began = self.templates.bank(obj_id), time.perf_counter()
-        answers: list[Answer] = []
+        answers, before = list[Answer](), list[Answer]()
         for target in self.groups[group]:
-            answers += self._answers(target, bank)
+            before = self._answers(target, bank, before)
+            answers += before
             advance(1)
         seconds = sum(sum(a.times_s.values()) for a in answers if isinstance(a, PoseEstimate))
         document = {"answers": [answer_to_record(answer) for answer in answers]}
@@ -163,27 +171,39 @@ class PoseNodes:
     def _detections(self, target: Target) -> list[tuple[int, Detection]]:
         return self.queries.of_target.get((target.scene_id, target.im_id, target.obj_id), [])
 
-    def _answers(self, target: Target, bank: StoredBank) -> list[Answer]:
-        """One answer per detection of a target, or one stating that there is none."""
+    def _answers(self, target: Target, bank: StoredBank, before: Sequence[Answer]) -> list[Answer]:
+        """One answer per detection of a target, or one that says that there is no detection.
+
+        ``before``: the answers of the object's target before this one.
+        """
         cropped = {found.index: found for found in self.queries.found((target.scene_id, target.im_id))}
         mine = self._detections(target)
         if not mine:
             reason = f"object {target.obj_id} was not detected in scene {target.scene_id}, image {target.im_id}"
             return [NoEstimate(target.scene_id, target.im_id, target.obj_id, "detect", reason)]
-        return [self._answer(nth, index, d, cropped.get(index), bank) for nth, (index, d) in enumerate(mine)]
+        return [self._answer(nth, index, d, cropped.get(index), bank, before) for nth, (index, d) in enumerate(mine)]
 
-    def _answer(self, nth: int, index: int, d: Detection, found: CroppedDetection | None, bank: StoredBank) -> Answer:
+    def _answer(
+        self,
+        nth: int,
+        index: int,
+        d: Detection,
+        found: CroppedDetection | None,
+        bank: StoredBank,
+        before: Sequence[Answer],
+    ) -> Answer:
         template_id: int | None = None
         try:
             if d.defect is not None:
                 raise NoPose("detect", d.defect)
             if found is None:
                 raise NoPose("crop", self.queries.crop_failure(index, d))
-            query, shared_s = self.query(found)
-            trace = trace_guesses(self.context.stages, query, bank)
+            query, shared_s = self.query(found, self.priors.prior(d, nth, before))
+            trace = trace_detection(self.context.stages, query, bank)
             self._keep(index, trace)
             template_id = trace.best.template_id
-            return self._estimate(nth, d, trace.query or query, trace, bank, shared_s)
+            used = query if trace.query is None else replace(trace.query, prior=query.prior)
+            return self._estimate(nth, d, used, trace, bank, shared_s)
         except NoPose as failure:
             return NoEstimate(d.scene_id, d.im_id, d.obj_id, failure.stage, failure.reason, nth, d.gt_id, template_id)
 
@@ -197,12 +217,26 @@ class PoseNodes:
 
         From memory, there is no other hypothesis than the best.
         """
-        kept = self._kept.get(found.index)
-        return kept or trace_guesses(self.context.stages, self.query(found)[0], bank)
+        if (kept := self._kept.get(found.index)) is not None:
+            return kept
+        target = next(t for t in self.context.targets if _is_of(found.detection, t))
+        nth = [index for index, _ in self._detections(target)].index(found.index)
+        prior = self.priors.prior(found.detection, nth, self._answers_before(target))
+        return trace_detection(self.context.stages, self.query(found, prior)[0], bank)
 
-    def query(self, found: CroppedDetection) -> tuple[Query, dict[str, float]]:
+    def _answers_before(self, target: Target) -> list[Answer]:
+        """The stored answers of the frame before a target's, of the same object; none of a data set without order."""
+        if not self.context.dataset.is_video:
+            return []
+        group = (target.scene_id, target.obj_id)
+        earlier = [t for t in self.groups[group] if t.im_id < target.im_id]
+        stored = map(answer_from_record, self.context.store.read(self.poses(group)).document["answers"])
+        return [answer for answer in stored if earlier and answer.im_id == earlier[-1].im_id]
+
+    def query(self, found: CroppedDetection, prior: Prior | None = None) -> tuple[Query, dict[str, float]]:
         """A detection as input of the online route (with ground truth for oracles only), and its seconds."""
         query, shared_s = self.queries.query(found)
+        query = replace(query, prior=prior)
         if self.context.stages.oracle:
             query = replace(query, truth=self._truth(found.detection))
         return query, shared_s
@@ -233,7 +267,7 @@ class PoseNodes:
             im_id=d.im_id,
             obj_id=d.obj_id,
             detection_id=nth,
-            T_cam_obj=self._canonical(T_cam_obj, d.obj_id),
+            T_cam_obj=self._canonical(T_cam_obj, d.obj_id, query.prior),
             score=d.score * best.inliers / max(count, 1),
             detection_score=d.score,
             template_id=best.template_id,
@@ -284,8 +318,15 @@ class PoseNodes:
         geometry = route.geometry(route.view(trace.best), trace.best.pair)
         return collect_evidence(trace, query, geometry, self.templates.extents.read(obj_id))
 
-    def _canonical(self, T_cam_obj: Float[np.ndarray, "4 4"], obj_id: int) -> Float[np.ndarray, "4 4"]:
-        """The pose, or the canonical one of its symmetric copies if symmetries were detected on the mesh."""
+    def _canonical(
+        self, T_cam_obj: Float[np.ndarray, "4 4"], obj_id: int, prior: Prior | None = None
+    ) -> Float[np.ndarray, "4 4"]:
+        """The pose, or, where symmetries were found, the copy nearest the prior or the one that stands for all."""
         if not self.context.dataset.finds_symmetries:
             return T_cam_obj
-        return make_canonical(T_cam_obj, self.templates.extents.read(obj_id).symmetries)
+        near = np.eye(4) if prior is None else prior.T_cam_obj
+        return make_canonical(T_cam_obj, self.templates.extents.read(obj_id).symmetries, near=near)
+
+
+def _is_of(d: Detection, target: Target) -> bool:
+    return (d.scene_id, d.im_id, d.obj_id) == (target.scene_id, target.im_id, target.obj_id)

@@ -43,6 +43,14 @@ class Truth:
 
 
 @dataclass(frozen=True, eq=False)
+class Prior:
+    """An expected pose T_cam_obj (mm), such as that of the frame before, and the object's symmetries."""
+
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    symmetries: Float[np.ndarray, "s 4 4"]
+
+
+@dataclass(frozen=True, eq=False)
 class Query:
     """One detection: features and mask of its crop, A_crop_img and the image's K. ``truth`` is set for oracles only.
 
@@ -56,6 +64,7 @@ class Query:
     truth: Truth | None = None
     others: Callable[[], Iterator[Query]] | None = None
     rgb: UInt8[np.ndarray, "S S 3"] | None = None
+    prior: Prior | None = None
     memo: Memo = field(default_factory=Memo, init=False, repr=False)
 
     @property

@@ -383,6 +383,7 @@ def test_every_input_of_a_photograph_is_in_a_key(tmp_path: Path, record_property
         "distorted box": box | {"distortion": (-0.05, 0.0, 0.0, 0.001)},
         "other mesh": {"mesh": str(root / "models" / "obj_000001.ply")},
         "name": {"name": "other"},
+        "video": {"video": True},
         "mask_label": {"mask": write_labels(root / "labels.png"), "mask_label": 2},
         "image": {"image": str(root / SCENE / "rgb" / "000003.png")},
         "depth": {"depth": str(root / SCENE / "depth" / "000000.png")},
