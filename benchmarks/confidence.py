@@ -22,7 +22,7 @@ from hydra import compose, initialize_config_dir
 from jaxtyping import Bool, Float
 from omegaconf import OmegaConf
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, logsumexp
 
 from benchmarks.accuracy import path_override
 from benchmarks.run_pool import run_all
@@ -121,6 +121,7 @@ def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[
     terms = [_standardise(Term(name, transform, 0.0, 1.0, 0.0, 0.0), examples) for name, transform, _ in chosen]
     x, signs = _values(terms, examples), [sign for *_, sign in chosen]
     (bias_20, *w_20), (bias_10, *w_10) = (fit_signed(x, right(examples, limit), signs) for limit in LIMITS)
+    rival_power, rival_odds = fit_rivals(examples)
     weights = zip(terms, w_20, w_10, strict=True)
     fitted = [replace(term, weight_20=round(float(a), 5), weight_10=round(float(b), 5)) for term, a, b in weights]
     fitted = [term for term in fitted if term.weight_20 or term.weight_10]
@@ -132,8 +133,8 @@ def fit(examples: Sequence[Example], kinds: Mapping[str, str], recipes: Mapping[
         bias_10=round(float(bias_10), 5),
         accept=ACCEPT_FROM,
         reject=REJECT_BELOW,
-        rival_power=4.0,
-        rival_share=_share_of_rivals(examples),
+        rival_power=rival_power,
+        rival_odds=rival_odds,
         command=command,
         measured={},
     )
@@ -168,10 +169,26 @@ def _values(terms: Sequence[Term], examples: Sequence[Example]) -> Float[np.ndar
     return np.array([[term.value(e.estimate.evidence) for term in terms] for e in examples])
 
 
-def _share_of_rivals(examples: Sequence[Example]) -> float:
-    """The share of wrong poses with alternatives that have the right pose among these."""
-    wrong = [e for e in examples if e.error >= LIMITS[0] and e.rivals]
-    return round(float(np.mean([any(rival < LIMITS[0] for rival in e.rivals) for e in wrong])), 3) if wrong else 0.0
+def fit_rivals(examples: Sequence[Example]) -> tuple[float, float]:
+    """``rival_power`` and ``rival_odds`` of a calibration, by maximum likelihood (conditional logit).
+
+    Uses the poses of which exactly one, or one of its alternatives, is right. Without any, no alternative is likely.
+    """
+    sets: list[tuple[int, Float[np.ndarray, " k"]]] = []
+    for e in examples:
+        is_right = [error < LIMITS[0] for error in (e.error, *e.rivals)]
+        if e.rivals and sum(is_right) == 1:
+            support = np.array([alternative.support for alternative in e.estimate.alternatives])
+            sets.append((is_right.index(True), np.log(np.clip(support, 1e-3, 1.0))))
+    if not sets:
+        return 1.0, 0.0
+
+    def loss(w: Float[np.ndarray, " 2"]) -> float:
+        logits = [np.concatenate([[0.0], w[0] * log_support - w[1]]) for _, log_support in sets]
+        return float(sum(logsumexp(z) - z[chosen] for z, (chosen, _) in zip(logits, sets, strict=True)))
+
+    power, minus_log_odds = minimize(loss, [4.0, 1.0], bounds=[(0, 50), (0, 10)], method="L-BFGS-B").x
+    return round(float(power), 2), round(float(np.exp(-minus_log_odds)), 3)
 
 
 def right(examples: Sequence[Example], limit: float = LIMITS[0]) -> Bool[np.ndarray, " n"]:

@@ -58,9 +58,9 @@ class Calibration:
     """A fitted model. ``kinds`` and ``recipes`` (digests): of the stages that it was fitted with.
 
     ``bias_20``, ``bias_10``: intercepts for the thresholds of 20 % and 10 % of the diameter. A pose is accepted at a
-    confidence of at least ``accept`` and rejected below ``reject``. ``rival_share``: probability that a wrong pose has
-    the right one among its alternatives; they share it in proportion to ``support ** rival_power``. ``command``: wrote
-    the file. ``measured``: quality on test scenes.
+    confidence of at least ``accept`` and rejected below ``reject``. An alternative is right with
+    ``rival_odds * support ** rival_power`` times the probability of the pose. ``command``: wrote the file.
+    ``measured``: quality on test scenes.
     """
 
     kinds: Mapping[str, str]
@@ -71,7 +71,7 @@ class Calibration:
     accept: float
     reject: float
     rival_power: float
-    rival_share: float
+    rival_odds: float
     command: str
     measured: Mapping[str, Any]
 
@@ -108,14 +108,11 @@ class Calibration:
         return "check" if confidence >= self.reject else "reject"
 
     def _weigh(self, estimate: PoseEstimate, confidence: float) -> tuple[Any, ...]:
-        """The alternatives with their probabilities: they divide a share of 1 - confidence by their support."""
-        powers = [alternative.support**self.rival_power for alternative in estimate.alternatives]
-        total = max(sum(powers), 1e-12)
-        left = (1 - confidence) * self.rival_share
-        return tuple(
-            replace(alternative, weight=left * power / total)
-            for alternative, power in zip(estimate.alternatives, powers, strict=True)
-        )
+        """The alternatives with their probabilities, which sum to 1 - confidence at most."""
+        alternatives = estimate.alternatives
+        likely = [confidence * self.rival_odds * min(a.support, 1.0) ** self.rival_power for a in alternatives]
+        scale = min(1.0, (1 - confidence) / max(sum(likely), 1e-12))
+        return tuple(replace(a, weight=scale * weight) for a, weight in zip(alternatives, likely, strict=True))
 
 
 def choose_calibration(stages: Stages, choice: str) -> Calibration | None:

@@ -24,7 +24,7 @@ TERMS = (Term("inliers", "log", 5.0, 1.0, 2.0, 1.0), Term("cosine", "linear", 0.
 def calibration(**changed) -> Calibration:
     return replace(
         Calibration(kinds={}, recipes={}, terms=TERMS, bias_20=0.0, bias_10=-1.0, accept=0.9, reject=0.2,
-                    rival_power=2.0, rival_share=0.5, command="", measured={}),
+                    rival_power=2.0, rival_odds=0.5, command="", measured={}),
         **changed,
     )  # fmt: skip
 
@@ -60,10 +60,14 @@ def test_missing_evidence_counts_as_its_mean_and_a_fallback_is_rejected():
     assert (fallback.confidence, fallback.decision, fallback.score) == (None, "reject", 0.0)
 
 
-def test_alternatives_share_the_probability_that_is_left():
-    found = calibration().apply(estimate({"other": 1.0}, 1.0, 0.5))
-    weights = [a.weight for a in found.alternatives]
-    assert weights == pytest.approx([0.5 * 0.5 * 0.8, 0.5 * 0.5 * 0.2])
+def test_alternatives_weigh_by_their_support_and_share_at_most_what_is_left():
+    weighed = estimate({"other": 1.0}, 1.0, 0.5)  # of confidence 0.5
+    found = calibration().apply(weighed)
+    assert [a.weight for a in found.alternatives] == pytest.approx([0.5 * 0.5, 0.5 * 0.5 * 0.25])
+    equal = calibration(rival_odds=1.0).apply(estimate({"other": 1.0}, 1.0))
+    assert equal.alternatives[0].weight == equal.confidence == 0.5
+    crowded = calibration(rival_odds=1.0).apply(estimate({"other": 1.0}, 1.0, 1.0))
+    assert [a.weight for a in crowded.alternatives] == pytest.approx([0.25, 0.25])
 
 
 def test_file_is_read_back_and_a_wrong_one_is_refused(tmp_path):
