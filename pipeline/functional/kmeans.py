@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float32, Int
 from torch import Tensor
 
+from pipeline.functional.products import row_products
 from pipeline.parallel import one_thread_per_kernel, ordered_map
 
 _BLOCK = 1 << 14  # points compared with all centres, or one, at a time: both maps of a pair fit in one block
@@ -70,7 +71,7 @@ def _assign(x: Tensor, centre: Tensor) -> Tensor:
     squared = (centre * centre).sum(1)
 
     def nearest(rows: Tensor) -> Tensor:
-        distance = torch.addmm(squared, rows, centre.T, alpha=-2)
+        distance = row_products(rows, centre).mul_(-2).add_(squared)
         return torch.from_numpy(distance.numpy().argmin(1))  # numpy's argmin is six times as fast
 
     return torch.cat(list(ordered_map(nearest, x.split(_BLOCK))))

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.functional.products import row_products
+
 _CPU_BLOCK, _CUDA_BLOCK = 1 << 20, 1 << 27  # values per block: fits the CPU's cache; amortises kernel launches on CUDA
 _PAIRS_BLOCK = 1 << 22  # cell pairs compared at a time
 _MAX_GROUP_RATIO = 4  # groups hold at most this many times the mean number of rows per label; larger ones are split
@@ -126,7 +128,7 @@ def nearest_rows(
 
     One matrix product serves both directions. Equal products: the first row of b, and every such row of a is its best.
     """
-    products = a @ b.T
+    products = row_products(a, b)
     if products.is_cuda:
         nearest, best = products.argmax(1), products.amax(0)
     else:  # numpy finds maxima several times as fast

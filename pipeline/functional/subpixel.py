@@ -40,7 +40,7 @@ def _mean_offset(
     offset: Float[Tensor, "k 2"],
 ) -> Float[Tensor, "m 2"]:
     """Mean offset (x, y), in cells, weighted by the neighbours' positive cosines with the feature; 0 if all are 0."""
-    weight = (neighbours @ feature[:, :, None])[..., 0].clamp(min=0) * valid
+    weight = (neighbours * feature[:, None]).sum(-1).clamp(min=0) * valid
     return weight @ offset / weight.sum(1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
 
 
