@@ -29,11 +29,11 @@ _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row, column
 class FeatureField:
     """A query's descriptors, prepared for bilinear sampling. n squares of four neighbouring cells, in row-major order.
 
-    ``corners``: descriptors of the four cells; ``gram``: their inner products. ``mask``: foreground cells.
+    ``cells``: the descriptors; ``gram``: inner products of the four of a square. ``mask``: foreground cells.
     ``normalize``: scale each sampled descriptor to unit length.
     """
 
-    corners: Float32[np.ndarray, "n 4 c"]
+    cells: Float32[np.ndarray, "cells c"]
     gram: Float32[np.ndarray, "n 4 4"]
     mask: Bool[np.ndarray, "h w"]
     normalize: bool
@@ -43,10 +43,31 @@ class FeatureField:
         cls, values: Float32[np.ndarray, "h w c"], mask: Bool[np.ndarray, "h w"], *, normalize: bool = False
     ) -> FeatureField:
         """The field of a feature map and its foreground."""
-        h, w, c = values.shape
-        four = [values[i : h - 1 + i, j : w - 1 + j] for i, j in _CORNERS]
-        corners = np.stack(four, axis=2).reshape(-1, 4, c)
-        return cls(corners, np.matmul(corners, corners.swapaxes(1, 2)), mask, normalize)
+        return cls(values.reshape(-1, values.shape[-1]), _corner_products(values), mask, normalize)
+
+    def read_corners(self, square: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 4 c"]:
+        """Descriptors of the four cells of some squares."""
+        width = self.mask.shape[1]
+        first = square // (width - 1) * width + square % (width - 1)
+        return self.cells.take(first[:, None] + [i * width + j for i, j in _CORNERS], axis=0)
+
+
+def _corner_products(v: Float32[np.ndarray, "h w c"]) -> Float32[np.ndarray, "n 4 4"]:
+    """Inner products of the four cells of each square; neighbouring squares share most of them."""
+
+    def multiply(a: Float32[np.ndarray, "y x c"], b: Float32[np.ndarray, "y x c"]) -> Float32[np.ndarray, "y x"]:
+        return np.einsum("yxc,yxc->yx", a, b)
+
+    own, across, down = multiply(v, v), multiply(v[:, :-1], v[:, 1:]), multiply(v[:-1], v[1:])
+    falling, rising = multiply(v[:-1, :-1], v[1:, 1:]), multiply(v[:-1, 1:], v[1:, :-1])
+    left, right = down[:, :-1], down[:, 1:]
+    rows = (
+        (own[:-1, :-1], across[:-1], left, falling),
+        (across[:-1], own[:-1, 1:], rising, right),
+        (left, rising, own[1:, :-1], across[1:]),
+        (falling, right, across[1:], own[1:, 1:]),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2).reshape(-1, 4, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +151,7 @@ def residuals_at(
     by_x, by_y = [b - 1, 1 - b, -b, b], [a - 1, -a, 1 - a, a]
     W = np.stack([np.stack(rows, axis=1) for rows in (value, by_x, by_y)], axis=1)
     ff = np.matmul(np.matmul(W, field.gram[square]), W.swapaxes(1, 2))
-    Cd = np.matmul(field.corners[square], descriptors[:, :, None]).astype(np.float64)
+    Cd = np.matmul(field.read_corners(square), descriptors[:, :, None]).astype(np.float64)
     fd = np.matmul(W, Cd)[:, :, 0]
     dd = np.square(descriptors, dtype=np.float64).sum(1)
     if field.normalize:
@@ -275,8 +296,8 @@ def l2_normalize(features: Float32[np.ndarray, "*n c"]) -> Float32[np.ndarray, "
 def build_level(
     query: Float32[np.ndarray, "h w c"],
     query_mask: Bool[np.ndarray, "h w"],
-    template: Float32[np.ndarray, "h w c"],
-    template_mask: Bool[np.ndarray, "h w"],
+    template: Float32[np.ndarray, "y x c"],
+    template_mask: Bool[np.ndarray, "y x"],
     cell: Int[np.ndarray, " m"],
     points_obj: Float[np.ndarray, "m 3"],
     *,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from pydantic import Field
 from torch import Tensor
 
@@ -55,14 +55,14 @@ class Featuremetric(Refiner):
 
     def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], geometry: PairGeometry) -> Float[np.ndarray, "4 4"]:
         """A pose (mm) of lower cost, or the one given; the latter also where fewer than 6 cells have a point."""
-        pair = geometry.pair
-        query, template = self._descriptors(pair.query), self._descriptors(pair.template)
-        query_mask, template_mask = pair.query_mask.cpu().numpy(), pair.template_mask.cpu().numpy()
-        rows = self._choose_rows(geometry.points_obj)
-        if len(rows) < MIN_POINTS or not query_mask.any():
+        pair, rows = geometry.pair, self._choose_rows(geometry.points_obj)
+        if len(rows) < MIN_POINTS or not pair.query_mask.any():
             return T_cam_obj
+        K_cell = cell_affine(size=geometry.crop_size, cells=pair.query_mask.shape[-1]) @ geometry.K_crop
+        query, query_mask, first_xy = self._cut_foreground(pair.query, pair.query_mask)
+        template, template_mask, _ = self._cut_foreground(pair.template, pair.template_mask)
         cell, points = np.flatnonzero(template_mask)[rows], geometry.points_obj[rows]
-        K_cell = cell_affine(size=geometry.crop_size, cells=query_mask.shape[-1]) @ geometry.K_crop
+        K_cell[:2] -= first_xy[:, None] * K_cell[2]
         T = T_cam_obj
         for sigma in self.sigmas_cells:
             surface, field = build_level(
@@ -81,9 +81,19 @@ class Featuremetric(Refiner):
         before, after = (normal_equations(surface, field, K_cell, pose, robust)[0] for pose in (T_cam_obj, T))
         return T if after < before else T_cam_obj
 
-    def _descriptors(self, features: Float[Tensor, "d h w"]) -> Float32[np.ndarray, "h w d"]:
-        maps = np.ascontiguousarray(features.float().movedim(0, -1).cpu().numpy())
-        return l2_normalize(maps) if self.normalise else maps
+    def _cut_foreground(
+        self, features: Float[Tensor, "d h w"], mask: Bool[Tensor, "h w"]
+    ) -> tuple[Float32[np.ndarray, "y x d"], Bool[np.ndarray, "y x"], Int[np.ndarray, " 2"]]:
+        """Descriptors and mask of the foreground's bounding box with a cell around it, and its first cell (x, y).
+
+        What lies farther from the foreground is never sampled.
+        """
+        inside = mask.cpu().numpy()
+        (top, bottom), (left, right) = (np.flatnonzero(inside.any(axis))[[0, -1]] for axis in (1, 0))
+        part = np.s_[max(top - 1, 0) : bottom + 2, max(left - 1, 0) : right + 2]
+        cut = features.movedim(0, -1)[part].float().cpu().numpy()
+        descriptors = l2_normalize(cut) if self.normalise else np.ascontiguousarray(cut)
+        return descriptors, inside[part], np.array([max(left - 1, 0), max(top - 1, 0)])
 
     def _choose_rows(self, points_obj: Float[np.ndarray, "m 3"]) -> np.ndarray:
         """Rows with a point, in order; at most ``max_points``."""
