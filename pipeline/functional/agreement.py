@@ -39,8 +39,8 @@ def measure_agreement(
         return 0.0, 0.0
     covered = torch.zeros_like(query_mask)
     covered[row, column] = True
-    query_features = l2_normalize(query[:, row[on_object], column[on_object]].float().T)
-    template_features = l2_normalize(template.flatten(1)[:, template_cell[on_object]].float().T)
+    query_features = l2_normalize(query.movedim(0, -1)[row[on_object], column[on_object]].float())
+    template_features = l2_normalize(template.movedim(0, -1).flatten(0, 1)[template_cell[on_object]].float())
     cosine = (query_features * template_features).sum(1)
     return float(cosine.mean()), float((_close(covered) & query_mask).sum() / query_mask.sum())
 

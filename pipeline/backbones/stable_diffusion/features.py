@@ -203,10 +203,8 @@ def _average(members: Sequence[FeatureMaps]) -> FeatureMaps:
 
 
 def _place(model: Any, device: torch.device) -> nn.Module:
-    model.eval().requires_grad_(False)
-    if device.type == "cuda":
-        return model.to(device, memory_format=torch.channels_last)
-    return model.to(device)
+    placed: nn.Module = model.eval().requires_grad_(False).to(device, memory_format=torch.channels_last)
+    return placed
 
 
 def _check(spec: DiffusionFeatures, configs: DiffusionConfigs, layers: Sequence[int]) -> None:

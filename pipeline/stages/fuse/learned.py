@@ -14,6 +14,7 @@ from pipeline.backbones.extractor import Extractor
 from pipeline.errors import BadInput
 from pipeline.functional.aggregation import Aggregation
 from pipeline.functional.gradients import EDGES, NEIGHBOURHOOD, append_edges
+from pipeline.functional.maps import put_channels_last
 from pipeline.functional.masks import cell_mask
 from pipeline.io.checkpoints import read_json
 from pipeline.io.digests import FileChanged, file_digest
@@ -82,12 +83,12 @@ class Learned(Fuser[EncodedMap]):
 
     def encode(self, crop: CropFeatures, fitted: FittedArrays) -> EncodedMap:
         """The head's map, with the gradient histograms beside it."""
-        maps = {layer: crop.maps[layer][None].float() for layer in self.layers}
+        maps = {layer: put_channels_last(crop.maps[layer]).float()[None] for layer in self.layers}
         with torch.no_grad():
             described = _head(maps[self.layers[0]].device, self.weights_digest)(maps)
             if EDGES in maps:
                 described = append_edges(described, maps[EDGES], weight=self.edges)
-        return EncodedMap(described[0], cell_mask(crop.mask, cells=described.shape[-1]))
+        return EncodedMap(put_channels_last(described[0]), cell_mask(crop.mask, cells=described.shape[-1]))
 
     def pair(self, query: EncodedMap, template: EncodedMap) -> FusedPair:
         """Fused maps. Raises NoPose for an empty mask."""
@@ -111,7 +112,9 @@ def _head(device: torch.device, weights_digest: str) -> Aggregation:
     channels = {layer: state[f"mix.{k}.weight"].shape[1] for k, layer in enumerate(LAYERS)}
     head = Aggregation(channels, state["narrow.weight"].shape[0])
     head.load_state_dict(state)
-    return head.eval().requires_grad_(False).to(device)
+    untyped: Any = head.eval().requires_grad_(False)  # torch's signature of to() lacks memory_format
+    placed: Aggregation = untyped.to(device, memory_format=torch.channels_last)
+    return placed
 
 
 def _read_trained_on() -> dict[str, Any]:
