@@ -87,7 +87,7 @@ bench: $(STAMP) ## measure times and compare them with references and targets; A
 	$(PY) -m benchmarks $(ARGS)
 
 test: $(STAMP) gl ## the whole test suite
-	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal $(ARGS)
+	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-fast: $(STAMP) ## the tests that take less than 20 seconds each
 	$(PY) -m pytest -m "not slow and not faults" $(ARGS)

@@ -7,6 +7,7 @@ read from the folder ``reference`` next to it. Tests whose data are missing are 
 
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,10 +31,17 @@ def pytest_configure(config: pytest.Config) -> None:
     PYTEST_DEBUG_TEMPROOT or --basetemp choose another place.
     """
     chosen = config.option.basetemp or "PYTEST_DEBUG_TEMPROOT" in os.environ
-    if chosen or not os.access(MEMORY, os.W_OK) or psutil.virtual_memory().available < 12 * 2**30:
+    if chosen or not os.access(MEMORY, os.W_OK) or psutil.virtual_memory().available < 8 * 2**30:
         return
-    if shutil.disk_usage(MEMORY).free > 8 * 2**30:
+    if shutil.disk_usage(MEMORY).free > 6 * 2**30:
         os.environ["PYTEST_DEBUG_TEMPROOT"] = str(MEMORY)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first, then those with many tests: workers that take file by file end together."""
+    tests = Counter(item.path for item in items)
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path not in slow, -tests[item.path], item.path))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
