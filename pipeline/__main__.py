@@ -2,7 +2,7 @@
 
 ``dzop ...`` and ``python -m pipeline ...`` are the same. ``dzop cache`` manages the store, ``dzop fetch`` downloads
 datasets, ``dzop reproduce`` runs what the paper ran; ``dzop score`` and ``dzop lint`` read results files;
-``dzop symmetry`` finds symmetries of meshes.
+``dzop symmetry`` finds symmetries of meshes, ``dzop watch`` estimates poses of new photographs in a folder.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pipeline.errors import BadInput, DzopError
 from pipeline.io.digests import track_files
 from pipeline.places import CONF, PACKAGE
 
-COMMANDS = ("cache", "doctor", "fetch", "lint", "reproduce", "score", "symmetry")
+COMMANDS = ("cache", "doctor", "fetch", "lint", "reproduce", "score", "symmetry", "watch")
 """Commands beside a run; each is ``<name>_command`` of a module of pipeline/cli."""
 RESUME = "Completed entries are cached; rerun to resume."
 READERS = ("__main__.py", "configuration.py")  # our modules whose frames may lie between Hydra's
@@ -63,7 +63,8 @@ def main() -> None:
     try:
         with stop_on_signals():
             if sys.argv[1:2] and sys.argv[1] in COMMANDS:
-                with track_files():
+                # Files of one run must not change, but dzop watch waits for files that do.
+                with nullcontext() if sys.argv[1] == "watch" else track_files():
                     _load_command(sys.argv[1])(sys.argv[2:])
             else:
                 _run_jobs()
