@@ -242,7 +242,8 @@ def benchmark(folder: Path, out: Path, overrides: Sequence[str]) -> str:
     kinds, recipes = identify_variants(stages), identify_settings(stages)
     fitting = [e for seed in FIT_SEEDS for e in collect(folder, seed, overrides)]
     testing = [e for seed in TEST_SEEDS for e in collect(folder, seed, overrides)]
-    command = " ".join(["python -m benchmarks.confidence", *overrides])
+    written = [] if out == SHIPPED / "dzop_x.json" else ["--out", str(out)]
+    command = " ".join(["python -m benchmarks.confidence", *overrides, *written])
     calibration = fit(fitting, kinds, recipes, command)
     confidence = confidences(calibration, testing)
     measured = measure(confidence, testing, calibration.accept)

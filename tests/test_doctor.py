@@ -114,6 +114,36 @@ def test_masks_that_do_not_fit(folder, tmp_path):
     said(list(examine(str(folder / "mug.ply"), str(tmp_path / "dark.png"), "600,600,320,240")), "very dark")
 
 
+def test_units_of_the_mesh_are_those_of_a_run(folder, tmp_path):
+    write_ply(tmp_path / "metres.ply", Mesh(MESH.vertices / 1000, MESH.faces, MESH.colours))
+    given = (str(tmp_path / "metres.ply"), str(folder / "shot.png"), "600,600,320,240", str(folder / "mask.png"))
+    said(list(examine(*given)), "it looks like metres")
+    for units in ("m", "auto"):
+        assert [f for f in examine(*given, units=units) if f.level in ("warning", "error")] == []
+
+
+def test_a_box_instead_of_a_mask(folder):
+    given = (str(folder / "mug.ply"), str(folder / "shot.png"), "600,600,320,240")
+    rows, columns = np.nonzero(np.asarray(PIL.Image.open(folder / "mask.png")))
+    inside = f"{columns.min()},{rows.min()},{np.ptp(columns)},{np.ptp(rows)}"
+    found = list(examine(*given, bbox=inside))
+    assert [finding.about for finding in found][-2:] == ["box", "distance"]
+    assert [finding for finding in found if finding.level in ("warning", "error")] == []
+    said(list(examine(*given, bbox="300,200,640,480")), "of it lies outside the image")
+    said(list(examine(*given, bbox="900,200,40,40")), "of a box inside the image")
+
+
+def test_a_depth_image_of_another_unit_or_with_holes(folder, tmp_path):
+    mask = np.asarray(PIL.Image.open(folder / "mask.png")) > 0
+    given = (str(folder / "mug.ply"), str(folder / "shot.png"), "600,600,320,240", str(folder / "mask.png"))
+    path = tmp_path / "depth.png"
+    PIL.Image.fromarray((mask * 6000).astype(np.uint16)).save(path)  # tenths of a millimetre
+    said(list(examine(*given, depth=str(path))), "-> dataset.depth_scale=0.1 times the present one fits")
+    assert [f for f in examine(*given, depth=str(path), depth_scale=0.1) if f.level in ("warning", "error")] == []
+    PIL.Image.fromarray(np.zeros(SIZE_HW, np.uint16)).save(path)
+    said(list(examine(*given, depth=str(path))), "known in 0% of the object")
+
+
 def test_a_missing_file_is_an_error_and_the_exit_status(folder, capsys, monkeypatch):
     ran = run_dzop(capsys, monkeypatch, "doctor", str(folder / "none.ply"))
     assert ran.status == 1

@@ -101,6 +101,18 @@ def test_a_depth_image_gives_the_distance(estimator, folder):
         estimator(rgb, K, mask=mask, name="mug", depth_mm=np.zeros((3, 3)))
 
 
+def test_a_depth_image_is_used_inside_a_box_alone(folder):
+    mesh, (_, angles, t) = make_object(3), POSES["mug"]
+    T = rigid(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), np.array(t))
+    rgb, depth_mm = (images[0] for images in Raycast().render(mesh, K, T[None], SIZE_HW))
+    farther_mm = np.where(depth_mm > 0, depth_mm + 25, 0)  # as if K were 5 % off
+    with PoseEstimator.from_mesh(
+        folder / "mug.ply", settings=[*SMALL, "segment=none"], cache=folder / "cache"
+    ) as estimator:
+        result = estimator(rgb, K, bbox=[100, 55, 170, 140], depth_mm=farther_mm)
+    assert result.T_cam_obj[2, 3] == pytest.approx(525, abs=5)
+
+
 def test_an_overlay_shows_the_pose_and_its_axes(estimator, folder):
     rgb, mask = read(folder / "shot.png"), read(folder / "mug_mask.png")
     overlay = estimator(rgb, K, mask=mask, name="mug").overlay()

@@ -52,12 +52,12 @@ class MeshFiles:
 
     def digest(self, obj_id: int) -> str:
         """Digest of an object's mesh, scaled and simplified."""
-        return prepared_digest(self.path(obj_id), scale=self._factor(obj_id), simplify=self.simplify)
+        return prepared_digest(self.path(obj_id), scale=self.factor(obj_id), simplify=self.simplify)
 
     def model(self, obj_id: int) -> ObjectModel:
         """An object with its mesh scaled and simplified. Raises BadInput for a mesh too small to be in millimetres."""
         path = self.path(obj_id)
-        factor = self._factor(obj_id)
+        factor = self.factor(obj_id)
         mesh, facts = prepare_mesh(path, scale=factor, simplify=self.simplify)
         if self.units == "auto" and factor != self.scale:
             guess = f"taken as metres (units=auto), which makes its diameter {facts.diameter_mm:.4g} mm"
@@ -67,8 +67,8 @@ class MeshFiles:
             raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
         return ObjectModel(obj_id, mesh, facts.diameter_mm, facts=facts)
 
-    def _factor(self, obj_id: int) -> float:
-        """Millimetres per unit of the file."""
+    def factor(self, obj_id: int) -> float:
+        """Millimetres per unit of an object's file."""
         if self.units != "auto":
             return self.scale * _FACTORS[self.units]
         path = self.path(obj_id)

@@ -11,12 +11,15 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
+from pipeline.bop.given import MeshFiles, Unit
 from pipeline.bop.images import image_size, read_orientation, read_rgb
 from pipeline.bop.photo import Photo, PhotoConfig
+from pipeline.bop.scene import Box
 from pipeline.bop.symmetries import mesh_symmetries
 from pipeline.errors import DzopError
+from pipeline.functional.boxes import pixels_inside
 from pipeline.functional.camera_diagnosis import diagnose_camera
 from pipeline.functional.surface import signed_volume
 from pipeline.io.meshes import prepare_mesh
@@ -27,6 +30,9 @@ MANY_FACES, FEW_PIXELS, FAR_ORIGIN = 1_000_000, 1000, 1.5
 NEAR_MM, FAR_MM = 60.0, 10_000.0  # plausible distances of an object that a robot is to pick
 FLAT = 1e-3  # smallest over largest side of the bounding box; below this, a mesh counts as a sheet
 DARK, BRIGHT = 25.0, 235.0
+MOST_INSIDE = 0.9  # share of a box inside the image, below which it may be two corners
+FEWEST_MEASURED = 0.2  # share of an object's pixels with a depth
+FAR_OFF = 2.5  # ratio of measured depth and distance by size: occlusion and pose explain less
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,8 @@ class Finding:
 def doctor_command(arguments: Sequence[str]) -> None:
     """``dzop doctor MESH [IMAGE K [MASK]]``: print the findings. Exits with status 1 if one of them is an error."""
     options = _parser().parse_args(arguments)
-    findings = list(examine(options.mesh, options.image, options.K, options.mask, scale=options.scale))
+    given = {name: value for name, value in vars(options).items() if name not in ("mesh", "image", "K")}
+    findings = list(examine(options.mesh, options.image, options.K, **given))
     for finding in findings:
         print(finding.line())
     worst = [finding for finding in findings if finding.level in ("error", "warning")]
@@ -56,18 +63,41 @@ def doctor_command(arguments: Sequence[str]) -> None:
 
 
 def examine(
-    mesh: str, image: str | None = None, K: str | None = None, mask: str | None = None, *, scale: float = 1.0
+    mesh: str,
+    image: str | None = None,
+    K: str | None = None,
+    mask: str | None = None,
+    *,
+    bbox: str | None = None,
+    depth: str | None = None,
+    depth_scale: float = 1.0,
+    scale: float = 1.0,
+    units: Unit = "mm",
 ) -> Iterator[Finding]:
-    """All findings about a mesh file, and about a photograph, its K (as ``dataset.K``) and its mask."""
+    """All findings about a mesh file and a photograph. The arguments are fields of ``dataset``, as texts."""
     diameter_mm: float | None = None
     try:
-        read, facts = prepare_mesh(Path(mesh).expanduser(), scale=scale)
+        files = MeshFiles((Path(mesh).expanduser(),), scale, units=units)
+        factor = files.factor(1)
+        read, facts = prepare_mesh(files.path(1), scale=factor)
         diameter_mm = facts.diameter_mm
-        yield from examine_mesh(read, facts, scale)
+        yield from examine_mesh(read, facts, factor)
     except DzopError as error:
         yield Finding("error", "mesh", str(error))
-    if image is not None:
-        yield from _examine_photograph(mesh, image, K, mask, diameter_mm)
+    if image is None:
+        return
+    try:
+        size_hw = image_size(Path(image).expanduser())
+        yield from _examine_pixels(Path(image).expanduser(), size_hw)
+        if K is None:
+            yield Finding("error", "K", "not given", "give K in pixels as fx,fy,cx,cy, a camera file, or exif")
+            return
+        photo = PhotoConfig(
+            mesh=mesh, image=image, K=K, mask=mask, bbox=bbox, depth=depth, depth_scale=depth_scale
+        ).open()
+        yield from _examine_photograph(photo, size_hw, diameter_mm)
+    except DzopError as error:
+        yield Finding("error", "input", str(error))
 
 
 def examine_mesh(mesh: Mesh, facts: MeshFacts, scale: float) -> Iterator[Finding]:
@@ -116,24 +146,27 @@ def _examine_unit(diameter: float, scale: float) -> Finding:
     return Finding("error", "unit", f"{text}: it looks like {likely}", f"dataset.scale={scale * fitting[likely]:g}")
 
 
-def _examine_photograph(
-    mesh: str, image: str, K: str | None, mask: str | None, diameter_mm: float | None
-) -> Iterator[Finding]:
-    try:
-        size_hw = image_size(Path(image).expanduser())
-        yield from _examine_pixels(Path(image).expanduser(), size_hw)
-        if K is None:
-            yield Finding("error", "K", "not given", "give K in pixels as fx,fy,cx,cy, a camera file, or exif")
-            return
-        photo = PhotoConfig(mesh=mesh, image=image, K=K, mask=mask).open()
-        problem = diagnose_camera(photo.camera_matrix, size_hw, exif_orientation=photo.orientation(0, 0))
-        yield Finding("warning", "K", problem) if problem else Finding("ok", "K", "plausible for this image")
-        for text in photo.warnings:
-            yield Finding("warning", "K", text)
-        if mask is not None:
-            yield from _examine_mask(photo, size_hw, diameter_mm)
-    except DzopError as error:
-        yield Finding("error", "input", str(error))
+def _examine_photograph(photo: Photo, size_hw: tuple[int, int], diameter_mm: float | None) -> Iterator[Finding]:
+    """K, then mask or box, the distance that follows from its size, and the depth inside it."""
+    problem = diagnose_camera(photo.camera_matrix, size_hw, exif_orientation=photo.orientation(0, 0))
+    yield Finding("warning", "K", problem) if problem else Finding("ok", "K", "plausible for this image")
+    for text in photo.warnings:
+        yield Finding("warning", "K", text)
+    if photo.masks:
+        mask = photo.object_mask(photo.masks[0][0], size_hw)
+        yield from _examine_mask(mask)
+    elif photo.bbox_xyxy is not None:
+        mask = np.zeros(size_hw, dtype=bool)
+        mask[pixels_inside(photo.locate(photo.targets[0])[0].bbox_xyxy, size_hw)] = True
+        yield from _examine_box(photo.bbox_xyxy, size_hw)
+    else:
+        mask = np.ones(size_hw, dtype=bool)
+    located = bool(mask.any()) and not mask.all()
+    distance_mm = _implied_distance(photo, mask, diameter_mm) if located and diameter_mm is not None else None
+    if distance_mm is not None:
+        yield _examine_distance(distance_mm, "mask" if photo.masks else "box")
+    if photo.gives_depth and mask.any():
+        yield from _examine_depth(photo.depth_mm(0, 0)[mask], distance_mm)
 
 
 def _examine_pixels(path: Path, size_hw: tuple[int, int]) -> Iterator[Finding]:
@@ -150,10 +183,8 @@ def _examine_pixels(path: Path, size_hw: tuple[int, int]) -> Iterator[Finding]:
         )
 
 
-def _examine_mask(photo: Photo, size_hw: tuple[int, int], diameter_mm: float | None) -> Iterator[Finding]:
-    """Area, pieces and border of the mask, and the distance that follows from its size and the mesh's."""
-    path = photo.masks[0][0]
-    mask = photo.object_mask(path, size_hw)
+def _examine_mask(mask: Bool[np.ndarray, "H W"]) -> Iterator[Finding]:
+    """Area, pieces and border of the mask."""
     pixels, share = int(mask.sum()), float(mask.mean())
     if pixels == 0:
         yield Finding("error", "mask", "empty", "paint the object's pixels white")
@@ -169,16 +200,48 @@ def _examine_mask(photo: Photo, size_hw: tuple[int, int], diameter_mm: float | N
         yield Finding("note", "mask", "touches the border: part of the object may lie outside the image")
     if (pieces := _count_pieces(mask)) > 1:
         yield Finding("note", "mask", f"{pieces} separate pieces: a partly hidden object, or several objects")
-    if diameter_mm is not None:
-        yield _examine_distance(photo, mask, diameter_mm)
 
 
-def _examine_distance(photo: Photo, mask: Bool[np.ndarray, "H W"], diameter_mm: float) -> Finding:
-    """The distance at which an object of this diameter appears as large as the mask; if occluded, it is nearer."""
+def _examine_box(box: Box, size_hw: tuple[int, int]) -> Iterator[Finding]:
+    """How much of the box lies in the image."""
+    (x0, y0, x1, y1), (h, w) = box, size_hw
+    inside = max(min(x1, w) - max(x0, 0), 0) * max(min(y1, h) - max(y0, 0), 0) / ((x1 - x0) * (y1 - y0))
+    if inside < MOST_INSIDE:
+        text = f"{1 - inside:.0%} of it lies outside the image"
+        yield Finding("warning", "box", text, "give x, y, width, height, not two corners")
+    else:
+        yield Finding("ok", "box", f"{x1 - x0:.0f} x {y1 - y0:.0f} pixels; a mask gives better poses")
+
+
+def _examine_depth(depth_mm: Float32[np.ndarray, " n"], distance_mm: float | None) -> Iterator[Finding]:
+    """How much of the object has a depth, and whether that is near the distance that follows from its size."""
+    share = float((depth_mm > 0).mean())
+    if share < FEWEST_MEASURED:
+        yield Finding(
+            "warning", "depth", f"known in {share:.0%} of the object", "register depth to colour, or leave it"
+        )
+    if share == 0:
+        return
+    median_mm = float(np.median(depth_mm[depth_mm > 0]))
+    text = f"a median of {median_mm / 1000:.3g} m on the object"
+    if distance_mm is None or 1 / FAR_OFF < median_mm / distance_mm < FAR_OFF:
+        yield Finding("ok", "depth", text)
+        return
+    fitting = [f for f in (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001) if 0.5 < f * median_mm / distance_mm < 2]
+    remedy = f"dataset.depth_scale={fitting[0]:g} times the present one fits" if fitting else "check K and the mask"
+    yield Finding("warning", "depth", f"{text}, where mesh and K give {distance_mm / 1000:.3g} m", remedy)
+
+
+def _implied_distance(photo: Photo, mask: Bool[np.ndarray, "H W"], diameter_mm: float) -> float:
+    """The distance, mm, at which an object of this diameter appears as large as the mask; if occluded, it is nearer."""
     rows, columns = np.nonzero(mask)
     longest_px = float(np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1))
-    distance_mm = float(photo.camera_matrix[0, 0]) * diameter_mm / longest_px
-    text = f"mesh, K and mask give a distance of about {distance_mm / 1000:.3g} m"
+    return float(photo.camera_matrix[0, 0]) * diameter_mm / longest_px
+
+
+def _examine_distance(distance_mm: float, located_by: str) -> Finding:
+    """Whether the distance is plausible for an object that a robot is to pick."""
+    text = f"mesh, K and {located_by} give a distance of about {distance_mm / 1000:.3g} m"
     if NEAR_MM <= distance_mm <= FAR_MM:
         return Finding("ok", "distance", text)
     factors = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0}
@@ -203,5 +266,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("image", nargs="?", help="the photograph")
     parser.add_argument("K", nargs="?", help="fx,fy,cx,cy in pixels, a camera file, or exif")
     parser.add_argument("mask", nargs="?", help="the object's mask")
-    parser.add_argument("--scale", type=float, default=1.0, help="multiplies the mesh: 1000 for metres (default: 1)")
+    add = parser.add_argument
+    add("--bbox", help="x,y,width,height in pixels, instead of a mask")
+    add("--depth", help="a depth image registered to the photograph")
+    add("--depth-scale", type=float, default=1.0, help="mm per unit of the depth image (default: 1)")
+    add("--scale", type=float, default=1.0, help="multiplies the mesh: 1000 for metres (default: 1)")
+    add("--units", choices=("mm", "cm", "m", "inch", "auto"), default="mm", help="of the mesh (default: mm)")
     return parser

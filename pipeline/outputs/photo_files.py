@@ -20,7 +20,8 @@ from pipeline.report.scene_page import scene_html
 
 FRAME = (
     "T_cam_obj maps points of the object to the camera, p_cam = T_cam_obj p_obj, in millimetres. Camera: origin in the "
-    "optical centre, x right, y down, z forward (OpenCV). Object: coordinates of the mesh file times dataset.scale."
+    "optical centre, x right, y down, z forward (OpenCV). Object: coordinates of the mesh file, "
+    "converted to millimetres (dataset.units, dataset.scale)."
 )
 LATEST = "latest"
 Cards = Sequence[UInt8[ndarray, "_H _W 3"] | None]

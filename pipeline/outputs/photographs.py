@@ -17,7 +17,7 @@ from pipeline.outputs.photo_files import LATEST, Cards, link_latest, save_result
 from pipeline.outputs.pictures import Pictures
 from pipeline.outputs.pose_result import PoseResult, result_of
 
-FILES_VERSION = 2
+FILES_VERSION = 3
 """Raise it when the files written for the same results change."""
 RESERVED = (LATEST, "report", "multirun", "records")  # names of other files and folders in the folder of results
 
