@@ -70,7 +70,7 @@ class Bank:
         """Everything about one template."""
         return self.views[index]
 
-    def draw(
+    def render(
         self, T_cam_obj: Float[np.ndarray, "4 4"], A_crop_img: Float[np.ndarray, "3 3"], K: Float[np.ndarray, "3 3"]
     ) -> TemplateView:
         """Not used by the benchmark."""

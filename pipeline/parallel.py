@@ -8,12 +8,14 @@ backbone, blocks of a matrix. Results are returned in the order of the items.
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import cv2
@@ -35,7 +37,7 @@ class _Kernels:
 
     def limit(self) -> None:
         """Limit BLAS and OpenCV, which have one setting for the whole process."""
-        blas, opencv = ThreadpoolController().limit(limits=1, user_api="blas"), cv2.getNumThreads()
+        blas, opencv = _find_libraries(len(sys.modules)).limit(limits=1, user_api="blas"), cv2.getNumThreads()
         cv2.setNumThreads(1)
 
         def restore() -> None:
@@ -43,6 +45,12 @@ class _Kernels:
             cv2.setNumThreads(opencv)
 
         self.restore = restore
+
+
+@lru_cache(maxsize=1)
+def _find_libraries(modules: int) -> ThreadpoolController:
+    """The libraries that have threads; searched again, which takes 5 ms, if ``modules`` have been imported since."""
+    return ThreadpoolController()
 
 
 @dataclass

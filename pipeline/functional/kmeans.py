@@ -6,7 +6,9 @@ maps of a pair; seeding and Lloyd iterations below take a quarter of that on two
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +18,8 @@ from torch import Tensor
 from pipeline.functional.products import row_products
 from pipeline.parallel import one_thread_per_kernel, ordered_map
 
+Block = TypeVar("Block")
+Result = TypeVar("Result")
 _BLOCK = 1 << 14  # points compared with all centres, or one, at a time: both maps of a pair fit in one block
 
 
@@ -30,10 +34,10 @@ def kmeans(
     """
     x = points.cpu()
     centre = x[torch.from_numpy(kmeans_plus_plus(x.numpy(), count=count, seed=seed))]
-    label = _assign(x, centre)
+    label = _assign(x, centre, iterations)
     for _ in range(iterations):
         centre = _update_centres(x, label, centre)
-        before, label = label, _assign(x, centre)
+        before, label = label, _assign(x, centre, iterations)
         if torch.equal(before, label):
             break
     used, label = label.unique(return_inverse=True)
@@ -52,7 +56,7 @@ def kmeans_plus_plus(points: Float32[np.ndarray, "m c"], *, count: int, seed: in
     chosen = [min(int(draws[0] * len(points)), len(points) - 1)]
     for draw in draws[1:]:
         i = chosen[-1]
-        nearest = np.concatenate(list(ordered_map(partial(_nearest_seed, points, squared, nearest, i), blocks)))
+        nearest = np.concatenate(_map_blocks(partial(_nearest_seed, points, squared, nearest, i), blocks))
         cumulative = np.cumsum(nearest, dtype=np.float64)
         if cumulative[-1] <= 0:
             break
@@ -67,14 +71,19 @@ def _nearest_seed(points: np.ndarray, squared: np.ndarray, nearest: np.ndarray, 
     return np.minimum(nearest[rows], np.where(distance > 1e-6 * squared[i], distance, 0))  # rounding errors become 0
 
 
-def _assign(x: Tensor, centre: Tensor) -> Tensor:
+def _assign(x: Tensor, centre: Tensor, repeats: int) -> Tensor:
     squared = (centre * centre).sum(1)
 
     def nearest(rows: Tensor) -> Tensor:
-        distance = row_products(rows, centre).mul_(-2).add_(squared)
+        distance = row_products(rows, centre, repeats=repeats).mul_(-2).add_(squared)
         return torch.from_numpy(distance.numpy().argmin(1))  # numpy's argmin is six times as fast
 
-    return torch.cat(list(ordered_map(nearest, x.split(_BLOCK))))
+    return torch.cat(_map_blocks(nearest, x.split(_BLOCK)))
+
+
+def _map_blocks(function: Callable[[Block], Result], blocks: Sequence[Block]) -> list[Result]:
+    """Results for all blocks; without the machinery of threads for a single one."""
+    return [function(blocks[0])] if len(blocks) == 1 else list(ordered_map(function, blocks))
 
 
 def _update_centres(x: Tensor, label: Tensor, centre: Tensor) -> Tensor:

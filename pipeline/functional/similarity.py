@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.functional.products import row_products
 
-_CPU_BLOCK, _CUDA_BLOCK = 1 << 20, 1 << 27  # values per block: fits the CPU's cache; amortises kernel launches on CUDA
+_CPU_BLOCK, _CUDA_BLOCK = 1 << 19, 1 << 27  # values per block: fits the CPU's cache; amortises kernel launches on CUDA
 _PAIRS_BLOCK = 1 << 22  # cell pairs compared at a time
 _MAX_GROUP_RATIO = 4  # groups hold at most this many times the mean number of rows per label; larger ones are split
 
