@@ -110,7 +110,7 @@ def test_a_depth_image_is_used_inside_a_box_alone(folder):
         folder / "mug.ply", settings=[*SMALL, "segment=none"], cache=folder / "cache"
     ) as estimator:
         result = estimator(rgb, K, bbox=[100, 55, 170, 140], depth_mm=farther_mm)
-    assert result.T_cam_obj[2, 3] == pytest.approx(525, abs=5)
+    assert result.T_cam_obj[2, 3] == pytest.approx(525, abs=10)  # 500 from RGB alone, and a rotation that is rough
 
 
 def test_an_overlay_shows_the_pose_and_its_axes(estimator, folder):
