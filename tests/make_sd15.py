@@ -72,9 +72,13 @@ def write_folder(
     version: int = 1,
     dtype: str = "float32",
     seed: int = 0,
+    blank: bool = False,
     unet: Mapping[str, Any] = MappingProxyType({}),
 ) -> Path:
-    """The folder, with full-precision file names for any dtype. ``unet``: fields of its config that differ."""
+    """The folder, with full-precision file names for any dtype.
+
+    ``blank``: zero weights, since a billion random numbers take seconds. ``unet``: fields of its config that differ.
+    """
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 
     torch_dtype = getattr(torch, dtype)
@@ -82,18 +86,35 @@ def write_folder(
         ("unet", UNet2DConditionModel, unet_config(small=small, version=version) | dict(unet)),
         ("vae", AutoencoderKL, vae_config(small=small)),
     ):
-        randomise_weights(allocate_model(cls, config, torch_dtype), seed=seed).save_pretrained(root / part)
-    write_text_encoder(root / "text_encoder", text_config(small=small, version=version), seed=seed, dtype=torch_dtype)
+        model = allocate_model(cls, config, torch_dtype)
+        (clear_weights(model) if blank else randomise_weights(model, seed=seed)).save_pretrained(root / part)
+    text = text_config(small=small, version=version)
+    write_text_encoder(root / "text_encoder", text, seed=seed, dtype=torch_dtype, blank=blank)
     write_tokenizer(root / "tokenizer", padding={1: "<|endoftext|>", 2: "!"}[version])
     DDIMScheduler(beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear").save_pretrained(root / "scheduler")
     return root
 
 
-def write_text_encoder(folder: Path, config: dict[str, Any], *, seed: int, dtype: torch.dtype) -> None:
+def write_text_encoder(
+    folder: Path, config: dict[str, Any], *, seed: int, dtype: torch.dtype, blank: bool = False
+) -> None:
     from transformers import CLIPTextConfig, CLIPTextModel
 
     torch.manual_seed(seed)
-    CLIPTextModel(CLIPTextConfig(**config)).to(dtype).save_pretrained(folder)
+    if blank:
+        with torch.device("meta"):
+            model = CLIPTextModel(CLIPTextConfig(**config)).to(dtype)
+        clear_weights(model.to_empty(device="cpu")).save_pretrained(folder)
+    else:
+        CLIPTextModel(CLIPTextConfig(**config)).to(dtype).save_pretrained(folder)
+
+
+def clear_weights(model: torch.nn.Module) -> torch.nn.Module:
+    """The model with all weights and buffers zero."""
+    with torch.no_grad():
+        for values in (*model.parameters(), *model.buffers()):
+            values.zero_()
+    return model
 
 
 def write_tokenizer(folder: Path, *, padding: str) -> None:
