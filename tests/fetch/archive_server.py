@@ -14,7 +14,8 @@ class ArchiveServer:
     """Serves ``files`` (name -> content) below any path that ends with the name.
 
     ``breaks``: for each of the next downloads the number of bytes after which its connection is closed. ``stated``:
-    digests that are not those of the content. ``refuses``: status by name. ``sent``: bytes by name.
+    digests that are not those of the content. ``refuses``: status by name. ``sent`` and ``asked``: bytes and downloads
+    by name.
     """
 
     files: dict[str, bytes]
@@ -23,6 +24,7 @@ class ArchiveServer:
     refuses: dict[str, int] = field(default_factory=dict)
     ignores_ranges: bool = False
     sent: Counter = field(default_factory=Counter)
+    asked: Counter = field(default_factory=Counter)
 
     def __enter__(self):
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
@@ -52,6 +54,7 @@ def _handler(server: ArchiveServer) -> type[BaseHTTPRequestHandler]:
 
         def _answer(self, *, with_content: bool):
             name = self.path.rsplit("/", 1)[-1]
+            server.asked[name] += with_content
             status = server.refuses.get(name, 200 if name in server.files else 404)
             if status != 200:
                 self.send_response(status)
