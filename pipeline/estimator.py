@@ -4,6 +4,7 @@ from pipeline import PoseEstimator
 
 estimator = PoseEstimator.from_mesh("mug.ply")
 result = estimator(rgb, K, mask=mask)
+result = estimator(rgb, K)  # slower: finds the object in the image first
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from pipeline.items.views import Target
 from pipeline.outputs.pose_result import PoseResult, result_of
 from pipeline.parallel import use_threads
 from pipeline.progress import Progress
+from pipeline.stages.detect.search import Search
 from pipeline.store import MemoryStoreConfig, Store
 
 Mesh = str | PathLike[str]
@@ -84,22 +86,21 @@ class PoseEstimator:
     ) -> PoseResult:
         """The pose of one object in an image.
 
-        ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. Either ``mask``: h x w, 0
-        outside the object, or ``bbox``: x, y, width, height. ``name``: the object, if the estimator has several.
-        ``depth_mm``: h x w, registered to the image, 0 where unknown; the pose is fitted to it. ``prior``: the result
-        of the frame before, or its T_cam_obj (4 x 4, mm). It is followed if the image confirms it, which is faster;
-        otherwise all templates are searched. With a prior, mask and bbox may be missing: the object is then sought in
-        the box around the prior.
+        ``rgb``: h x w x 3, uint8. ``K``: 3 x 3, or fx, fy, cx, cy, in pixels of this image. ``mask``: h x w, 0 outside
+        the object, or ``bbox``: x, y, width, height; with neither, the object is searched for in the whole image, as by
+        ``detect=search``. ``name``: the object, if the estimator has several. ``depth_mm``: h x w, registered to the
+        image, 0 where unknown; the pose is fitted to it. ``prior``: the result of the frame before, or its T_cam_obj
+        (4 x 4, mm). It is followed if the image confirms it, which is faster; otherwise all templates are searched.
+        With a prior and neither mask nor bbox, the object is sought in the box around the prior.
         """
+        if mask is not None and bbox is not None:
+            raise BadInput("mask, bbox", found="both", needed="one of them, or neither to search for the object")
         if name is None and len(self.names) > 1:
             raise BadInput("name", found="nothing", needed=f"one of {', '.join(self.names)}")
         asked, rgb = self.names[0] if name is None else name, parse_image(rgb)
         if mask is None and bbox is None and (T_cam_obj := _prior_pose(prior)) is not None:
             bbox = self._box_around(asked, T_cam_obj, K, (rgb.shape[0], rgb.shape[1]))
-        if (mask is None) == (bbox is None):
-            found = "neither" if mask is None else "both"
-            raise BadInput("mask, bbox", found=found, needed="one of them, which says where the object is")
-        given = bbox if mask is None else np.asarray(mask)
+        given = bbox if mask is None else np.asarray(mask)  # None where there is neither
         return self.find(rgb, K, {asked: given}, depth_mm=depth_mm, priors={asked: [prior]})[0]
 
     def find(
@@ -113,8 +114,9 @@ class PoseEstimator:
     ) -> tuple[PoseResult, ...]:
         """The poses of several objects or instances in one image, in the order of ``locations``.
 
-        ``locations``: object name -> mask, box [x, y, width, height], or a list of these for several instances.
-        ``depth_mm``: as in ``__call__``. ``priors``: object name -> one prior per instance, as in ``__call__``.
+        ``locations``: object name -> mask, box [x, y, width, height], or a list of these for several instances; None
+        for all of them to search for each object in the whole image. ``depth_mm``: as in ``__call__``. ``priors``:
+        object name -> one prior per instance, as in ``__call__``.
         """
         frame = self._frame(parse_image(rgb), K, locations)
         if priors is not None:
@@ -175,8 +177,14 @@ class PoseEstimator:
         self._check_names(list(locations))
         size_hw = (rgb.shape[0], rgb.shape[1])
         camera_matrix = _parse_camera(K, size_hw)
-        located = {self.names.index(name) + 1: parse_locations(given, size_hw) for name, given in locations.items()}
-        targets = tuple(Target(SCENE_ID, IM_ID, obj_id, len(at)) for obj_id, at in sorted(located.items()))
+        if len({given is None for given in locations.values()}) > 1:
+            needed = "all of them, or none, to search for every object"
+            raise BadInput("locations", found="some without mask or box", needed=needed)
+        located = {
+            self.names.index(name) + 1: () if given is None else parse_locations(given, size_hw)
+            for name, given in locations.items()
+        }
+        targets = tuple(Target(SCENE_ID, IM_ID, obj_id, max(1, len(at))) for obj_id, at in sorted(located.items()))
         dataset = self._graph.context.dataset
         assert isinstance(dataset, Frame)
         return replace(dataset, targets=targets, rgb=rgb, camera_matrix=camera_matrix, locations=located)
@@ -204,8 +212,11 @@ class PoseEstimator:
         return [*low.tolist(), *(high - low).tolist()]
 
     def _estimate(self, frame: Frame, names: Sequence[str]) -> tuple[PoseResult, ...]:
-        context = self._graph.context.with_images(frame, Store(MemoryStoreConfig()))
+        detect = None if any(frame.locations.values()) else Search()
+        context = self._graph.context.with_images(frame, Store(MemoryStoreConfig()), detect)
         graph = Graph(context, self._graph.templates)
+        if graph.detections.searches:
+            graph.detections.searches.check()
         warnings, image = graph.warnings(), frame.image(SCENE_ID, IM_ID)
         results: dict[str, list[PoseResult]] = {name: [] for name in names}
         for answer in graph.poses.estimate():

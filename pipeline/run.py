@@ -138,7 +138,7 @@ def _print_plan(graph: Graph, options: Options) -> None:
 
 def _detect(graph: Graph, options: Options) -> None:
     """Detect the targets, and write the detections if they were computed rather than read from a file."""
-    if graph.detections.proposals:
+    if graph.detections.computed:
         _make_folder(Path(options.out))
     detections = graph.detect()
     _print_warnings(graph.detection_warnings())
@@ -146,7 +146,7 @@ def _detect(graph: Graph, options: Options) -> None:
     print(f"{len(detections) - len(unusable)} detections")
     for d in unusable[:MAX_ROWS]:
         print(f"object {d.obj_id} in scene {d.scene_id}, image {d.im_id}: {d.defect}")
-    if graph.detections.proposals:
+    if graph.detections.computed:
         print(f"written   {write_computed_detections(OutputFolder(graph, None, options))}")
 
 

@@ -357,11 +357,11 @@ def test_bad_input_is_one_line(photo, arguments: tuple[str, ...], part: str):
     assert len(ran.err.strip().splitlines()) == 1
 
 
-def test_a_photograph_without_mask_or_box_suggests_cnos(photo):
+def test_a_photograph_without_mask_or_box_suggests_a_search(photo):
     ran = photo("detect=photo")
     assert ran.status == 1
     assert "neither of mask and bbox" in ran.err
-    assert "detect=cnos" in ran.err
+    assert "detect=search" in ran.err
 
 
 def test_a_mask_with_a_detector_that_finds_objects_is_refused(photo):

@@ -159,6 +159,7 @@ def test_a_suspicious_mask_is_a_warning(estimator, folder):
         ({"mask": np.zeros(SIZE_HW, bool)}, "mask: found an empty mask, needs the object's pixels not 0"),
         ({"bbox": [0, 0, 5, 5]}, "mask, bbox: found both, needs one of them"),
         ({"mask": None, "bbox": [0, 0, 5]}, "bbox: found 3 numbers, needs 4: [x,y,width,height]"),
+        ({"mask": None}, "detect: found a search whose results nothing could verify, needs a method with"),
         ({"K": np.eye(4)}, "K: found 16 numbers, needs [fx,fy,cx,cy] or the 9 of the matrix, row by row"),
         ({"K": [600, 600, 2000, 1500]}, "K: found cx 2000, cy 1500, needs a principal point in or near the image"),
         ({"name": "cup"}, "name: found 'cup', needs one of mug, box"),

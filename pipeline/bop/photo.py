@@ -301,7 +301,7 @@ class Photo(GivenObjects):
     def locate(self, target: Target) -> list[Detection]:
         """Detections from the masks or the box. Raises BadInput if there are none, or if one does not fit."""
         if not self.masks and self.bbox_xyxy is None:
-            needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=cnos, which finds the object"
+            needed = "dataset.mask=FILE or dataset.bbox=[x,y,w,h], or detect=search, which finds the object"
             raise BadInput("dataset", found="neither of mask and bbox", needed=needed)
         size_hw = self.image_size(target.scene_id, target.im_id)
         if self.masks:

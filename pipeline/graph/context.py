@@ -24,6 +24,7 @@ from pipeline.method import Stages
 from pipeline.parallel import one_thread_per_kernel
 from pipeline.progress import Progress
 from pipeline.spec import Runtime
+from pipeline.stages.detect import Detector
 from pipeline.stages.extract import Backbone
 from pipeline.store import Layout, Ref, Store, make_ref
 
@@ -115,9 +116,15 @@ class Context:
         """Copy an array to the device."""
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
-    def with_images(self, dataset: Dataset, store: Store) -> Context:
-        """A context for other images of the same objects, which shares loaded weights and meshes."""
-        other = replace(self, dataset=dataset, targets=dataset.targets, store=store, progress=Progress(False))
+    def with_images(self, dataset: Dataset, store: Store, detect: Detector | None = None) -> Context:
+        """A context for other images of the same objects, which shares loaded weights and meshes.
+
+        ``detect`` replaces the detector.
+        """
+        stages = self.stages if detect is None else replace(self.stages, detect=detect)
+        other = replace(
+            self, stages=stages, dataset=dataset, targets=dataset.targets, store=store, progress=Progress(False)
+        )
         vars(other).update({name: getattr(self, name) for name in ("backbone", "models", "device")})
         other._mesh_digests.update(self._mesh_digests)
         return other

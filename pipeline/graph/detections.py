@@ -15,6 +15,7 @@ from pipeline.bop.masks import encode_rle
 from pipeline.errors import BadInput
 from pipeline.graph.context import Context
 from pipeline.graph.proposals import ProposalNodes
+from pipeline.graph.searches import SearchNodes
 from pipeline.io.digests import file_digest
 from pipeline.items.records import detection_from_record, detection_to_record
 from pipeline.items.views import Detection
@@ -32,6 +33,12 @@ class DetectionNodes:
 
     context: Context
     proposals: ProposalNodes | None
+    searches: SearchNodes | None = None
+
+    @property
+    def computed(self) -> bool:
+        """Whether detections are computed, not only read from files."""
+        return self.proposals is not None or self.searches is not None
 
     @cached_property
     def ref(self) -> Ref:
@@ -40,6 +47,8 @@ class DetectionNodes:
         recipe = {"kind": "detections", "detect": stages.detect.recipe()}
         if stages.segments:
             recipe["segment"] = stages.segment.recipe()
+        if self.searches is not None:
+            recipe["search"] = self.searches.recipe()
         targets = [[t.scene_id, t.im_id, t.obj_id, t.inst_count] for t in self.context.targets]
         asked: list[Any] = [targets, None]
         if not self.proposals:
@@ -52,6 +61,8 @@ class DetectionNodes:
         if proposals is None:
             files = context.stages.detect.sources(context.dataset, context.targets)
             digests = {"sources": _digest_sources(files, context.dataset.root)}
+            if self.searches is not None:
+                digests |= self.searches.inputs()
             if not context.stages.segments:
                 return digests
             return digests | {f"image {s}/{i}": context.dataset.image_digest(s, i) for s, i in context.image_ids}
@@ -62,7 +73,7 @@ class DetectionNodes:
     @property
     def known(self) -> bool:
         """Whether the detections are available without computing proposals or features."""
-        return self.proposals is None or self.context.store.is_complete(self.ref)
+        return not self.computed or self.context.store.is_complete(self.ref)
 
     @cached_property
     def all(self) -> list[Detection]:
@@ -75,7 +86,7 @@ class DetectionNodes:
             detections = self._detect()
             store.put_document(self.ref, [detection_to_record(d) for d in detections], rows=len(detections))
         detections = [detection_from_record(record) for record in store.read(self.ref).document]
-        if self.proposals is None and detections and all(d.defect for d in detections):
+        if not self.computed and detections and all(d.defect for d in detections):
             raise self._no_usable_detection(detections)
         self.context.progress.add("detections", **{"computed" if is_new else "reused": len(detections)})
         return detections
@@ -83,7 +94,7 @@ class DetectionNodes:
     def identity(self, detection: Detection) -> dict[str, Any]:
         """The part of a detection that poses depend on: all but the measured seconds, which differ in every run."""
         record = detection_to_record(detection)
-        return record | {"time_s": 0.0} if self.proposals else record
+        return record | {"time_s": 0.0} if self.computed else record
 
     def _no_usable_detection(self, detections: Sequence[Detection]) -> BadInput:
         """The error that lists the reasons, each with its first detection."""
@@ -99,7 +110,9 @@ class DetectionNodes:
     def _detect(self) -> list[Detection]:
         descriptors = None if self.proposals is None else self._describe(self.proposals)
         detections = self.context.stages.detect(self.context.dataset, self.context.targets, descriptors)
-        return [self._segment(d) for d in detections] if self.context.stages.segments else detections
+        if self.context.stages.segments:
+            detections = [self._segment(d) for d in detections]
+        return detections if self.searches is None else self.searches.complete(detections)
 
     def _segment(self, detection: Detection) -> Detection:
         """The detection, with a mask segmented inside its box if it had none and that succeeds; keeps the given box."""

@@ -20,6 +20,7 @@ from pipeline.graph.proposals import proposal_nodes
 from pipeline.graph.queries import QueryNodes
 from pipeline.graph.replay import Replayer
 from pipeline.graph.scores import ScoreNodes
+from pipeline.graph.searches import search_nodes
 from pipeline.graph.tasks import Counts, Task
 from pipeline.graph.templates import TemplateNodes
 from pipeline.items.records import Answer
@@ -35,7 +36,8 @@ class Graph:
     def __init__(self, context: Context, templates: TemplateNodes | None = None) -> None:
         self.context = context
         self.templates = templates or TemplateNodes(context)
-        self.detections = DetectionNodes(context, proposal_nodes(context))
+        searches = search_nodes(context, self.templates)
+        self.detections = DetectionNodes(context, proposal_nodes(context), searches)
         self.queries = QueryNodes(context, self.detections)
         self.poses = PoseNodes(context, self.templates, self.queries)
 
@@ -47,10 +49,12 @@ class Graph:
         stages.fuse.check(stages.extract)
         check_layers(stages)
         self.poses.priors.check()
+        if stages.detect.finds_objects and (where := self.context.dataset.location_field):
+            raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
         if self.detections.proposals:
-            if where := self.context.dataset.location_field:
-                raise BadInput(where, found=f"with {stages.detect.kind}", needed="detect=photo, or no mask and no box")
             self.detections.proposals.check()
+        if self.detections.searches:
+            self.detections.searches.check()
         self.templates.views = fit_to_budgets(self.context, self.detections.proposals)
 
     def memory(self, *, passes: bool) -> tuple[Memory, Memory | None]:
@@ -131,6 +135,8 @@ class Graph:
         tasks: list[Task[Any]] = [self.templates.onboard_task, self.queries.describe_task, self.poses.solve_task]
         if self.detections.proposals:
             tasks += [self.detections.proposals.describe_task, self.detections.proposals.propose_task]
+        if self.detections.searches:
+            tasks.append(self.detections.searches.proposals.propose_task)
         if task in (self.queries.describe_task.name, self.poses.solve_task.name):
             self.detect()  # does not belong to the item's counts
         self.context.progress.counts.clear()

@@ -63,8 +63,9 @@ class Plan:
                 not_downloaded = error
         if not_downloaded is not None:
             raise not_downloaded
-        if self.detections.proposals:
-            yield from self._proposal_nodes(self.detections.proposals)
+        searches = self.detections.searches
+        if proposals := self.detections.proposals or (searches and searches.proposals):
+            yield from self._proposal_nodes(proposals)
         if not self.detections.known:
             return
         for image in self.context.image_ids:

@@ -13,6 +13,7 @@ from pipeline.bop.masks import decode_rle
 from pipeline.errors import BadInput, NoPose
 from pipeline.functional.rigid import nearest_rotation, rigid
 from pipeline.graph.context import Context, ImageId, stack_crops
+from pipeline.graph.describe import describe_mask
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.tasks import Advance, Task
 from pipeline.graph.timings import timing_key
@@ -208,13 +209,9 @@ class QueryNodes:
         photo = self.context.dataset.image(detection.scene_id, detection.im_id)
         for mask in stages.segment.others(photo.rgb, detection.bbox_xyxy):
             try:
-                crop = stages.crop(photo.rgb, stages.crop.clean_query(mask), detection.bbox_xyxy, photo.K)
+                yield describe_mask(self.context, photo, mask, detection.bbox_xyxy)
             except NoPose:
                 continue
-            maps = self.context.maps(Crops(crop.rgb[None], crop.mask[None], crop.A_crop_img[None]), stages.layers)
-            features = {layer: self.context.tensor(values[0]) for layer, values in maps.items()}
-            described = CropFeatures(features, self.context.tensor(crop.mask))
-            yield Query(described, crop.A_crop_img, photo.K, rgb=crop.rgb)
 
     def crop_failure(self, index: int, d: Detection) -> str:
         """Why a detection has no crop."""

@@ -28,7 +28,7 @@ def write_files(
     folder: OutputFolder, answers: Sequence[Answer], evaluation: PoseEvaluation | None, warnings: Sequence[str]
 ) -> None:
     """Write the csv, poses.json and, unless they were read from a file, the detections."""
-    if folder.graph.detections.proposals:
+    if folder.graph.detections.computed:
         write_computed_detections(folder)
     estimates = [answer for answer in answers if isinstance(answer, PoseEstimate)]
     write_results(folder.path / folder.csv_name, make_rows(estimates, _seconds_by_image(estimates)))
@@ -57,7 +57,7 @@ def places_text(folder: OutputFolder, photographs: Sequence[Path] = (), *, overl
         if overlays:
             lines += [f"overlay   {photograph / 'overlay.jpg'}", f"page      {photograph / 'pose.html'}"]
     lines += [f"csv       {folder.path / folder.csv_name}", f"poses     {folder.path / 'poses.json'}"]
-    if folder.graph.detections.proposals:
+    if folder.graph.detections.computed:
         lines.append(f"detected  {folder.detections}")
     if overlays:
         colours = f"ground truth blue; green: MSSD < {CORRECT_MSSD:.0%} of the diameter"

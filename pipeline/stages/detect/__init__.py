@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,8 +14,9 @@ from torch import Tensor
 from pipeline.backbones.extractor import Extractor
 from pipeline.bop.dataset import Dataset
 from pipeline.items.views import Detection, Proposal, Target
-from pipeline.spec import Spec
+from pipeline.spec import Fraction, NonNegativeFloat, Positive, Spec, spec
 from pipeline.stages.detect.proposals import Proposer
+from pipeline.stages.detect.proposals.regions import Regions
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,38 @@ class Descriptors:
     of_image: Callable[[tuple[int, int]], ImageDescriptors]
 
 
+@spec
+class SearchPlan(Spec):
+    """How objects are searched for in the whole photograph.
+
+    Masks of ``proposals`` are compared with the object's templates: the route's matcher layer cell by cell, plus
+    ``colour`` times the similarity of their colours. The poses of the ``candidates`` most similar ones are estimated
+    (of two masks with an IoU above ``nms_iou`` only the better) until one has a confidence of ``enough``; the pose of
+    highest confidence decides. Below ``min_confidence`` the object is not found. Targets with a detection are searched
+    for only if its pose has a confidence below ``doubtful``; the search must then find a more confident one.
+    """
+
+    kind: ClassVar[str] = "search"
+    version: ClassVar[int] = 1
+
+    proposals: Proposer = field(default_factory=Regions)
+    candidates: Positive = 15
+    colour: NonNegativeFloat = 1.0
+    nms_iou: Fraction = 0.6
+    enough: Fraction = 0.9
+    min_confidence: Fraction = 0.5
+    doubtful: Fraction = 0.0
+
+
 class Detector(Spec, ABC):
     """Contract of a detect variant, which reads its detections from files or compares descriptors.
 
     ``gives_boxes``: whether detections may come without a mask; the segment stage then makes one.
+    ``finds_objects``: whether it looks for objects itself, so that a mask or box given by the user has no use.
     """
 
     gives_boxes: ClassVar[bool] = False
+    finds_objects: ClassVar[bool] = False
 
     @property
     def summary(self) -> str:
@@ -60,6 +86,11 @@ class Detector(Spec, ABC):
     @property
     def describer(self) -> Describer | None:
         """What to describe proposals and templates by: the graph computes descriptors and passes them to the call."""
+        return None
+
+    @property
+    def search_plan(self) -> SearchPlan | None:
+        """How the graph searches for targets that this detector has no detection of; None if it does not."""
         return None
 
     def sources(self, dataset: Dataset, targets: Sequence[Target]) -> list[Path]:

@@ -37,6 +37,7 @@ class Cnos(Detector):
     """
 
     kind: ClassVar[str] = "detect.cnos"
+    finds_objects: ClassVar[bool] = True
     version: ClassVar[int] = 1
 
     describe: Extractor

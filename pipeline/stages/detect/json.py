@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -19,8 +19,11 @@ from pipeline.functional.camera import mask_bbox
 from pipeline.io.digests import file_digest
 from pipeline.items.views import Detection, Target
 from pipeline.spec import Positive, spec
-from pipeline.stages.detect import Descriptors, Detector
+from pipeline.stages.detect import Descriptors, Detector, SearchPlan
 from pipeline.stages.detect.annotated import image_paths
+
+DOUBTFUL = 0.5
+"""Confidence of a pose below which ``search="doubtful"`` looks for the object elsewhere."""
 
 
 @spec
@@ -34,19 +37,30 @@ class Json(Detector):
 
     ``keep``: how many detections of a target are kept, best score first: the target's "inst_count", a number, or "all".
     Entries that cannot be used (``defect`` says why) only fill up what usable ones leave open.
+
+    ``search``: which targets are searched for in the whole photograph (see SearchPlan): none ("none"), those without a
+    usable detection ("missing"), or also those whose pose has a confidence below 0.5 ("doubtful").
     """
 
     kind: ClassVar[str] = "detect.json"
     version: ClassVar[int] = 2
     gives_boxes: ClassVar[bool] = True
+    added: ClassVar[Mapping[str, Any]] = {"search": "none"}
 
     path: str = ""
     keep: Literal["inst_count", "all"] | Positive = "inst_count"
+    search: Literal["none", "missing", "doubtful"] = "none"
 
     @property
     def summary(self) -> str:
         """As Detector.summary, with the file's name."""
-        return f"detections of {Path(self.path).name}"
+        searched = "" if self.search == "none" else f", {self.search} ones searched for"
+        return f"detections of {Path(self.path).name}{searched}"
+
+    @property
+    def search_plan(self) -> SearchPlan | None:
+        """As Detector.search_plan."""
+        return None if self.search == "none" else SearchPlan(doubtful=DOUBTFUL if self.search == "doubtful" else 0.0)
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the file's digest instead of its path."""
