@@ -10,11 +10,13 @@ import types
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import PIL.Image
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pipeline.bop.camera_files import read_camera
 from pipeline.functional.rigid import rigid
 from pipeline.io.meshes import write_ply
 from pipeline.stages.render.raycast import Raycast
@@ -70,6 +72,56 @@ def test_many_objects(folder, monkeypatch, capsys):
     given = ("frames/0.png", "300,300,160,120", *objects, "--out", "many")
     out = run_example(monkeypatch, capsys, folder, "03_many_objects.py", *given)
     assert [line.split(":")[0] for line in out.splitlines()] == ["cup", "mug"]
+
+
+def photograph_board(K: np.ndarray, T_cam_board: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """A chessboard of 6 x 5 squares of 30 mm as a camera with this distortion sees it."""
+    px_mm, margin = 4, 30
+    squares = np.indices((5, 6)).sum(0) % 2
+    board = np.pad(np.kron(squares, np.ones((30 * px_mm, 30 * px_mm))) * 255, margin * px_mm, constant_values=255)
+    board_px = np.diag([px_mm, px_mm, 1.0])
+    board_px[:2, 2] = margin * px_mm
+    homography = K @ T_cam_board[:3, [0, 1, 3]] @ np.linalg.inv(board_px)
+    ideal = cv2.warpPerspective(board.astype(np.uint8), homography, (640, 480), borderValue=128)
+    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(pixels, K, distortion, P=K).reshape(480, 640, 2).astype(np.float32)
+    return cv2.GaussianBlur(cv2.remap(ideal, straight[..., 0], straight[..., 1], cv2.INTER_LINEAR), (0, 0), 0.8)
+
+
+def test_calibrate_finds_the_camera_of_chessboards(tmp_path, monkeypatch, capsys):
+    K_true, distortion = np.array([[700.0, 0, 330], [0, 710, 250], [0, 0, 1]]), np.array([-0.12, 0.05, 0, 0])
+    for n, tilt in enumerate(
+        ([0, 0, 0], [25, 5, 0], [-25, 0, 10], [0, 30, 0], [5, -30, -10], [20, 20, 5], [-20, 25, 0])
+    ):
+        R = Rotation.from_euler("xyz", tilt, degrees=True).as_matrix()
+        T = rigid(R, np.array([0, 0, 380.0]) - R @ np.array([90, 75, 0]))
+        PIL.Image.fromarray(photograph_board(K_true, T, distortion)).save(tmp_path / f"{n}.png")
+    boards = sorted(str(path) for path in tmp_path.glob("*.png"))
+    monkeypatch.setattr(sys, "argv", ["04", *boards, "--corners", "5x4", "--out", str(tmp_path / "camera.json")])
+    runpy.run_path(str(EXAMPLES / "04_calibrate.py"), run_name="__main__")
+    assert "(good); written" in capsys.readouterr().out
+    camera = read_camera(tmp_path / "camera.json")
+    np.testing.assert_allclose(camera.K, K_true, rtol=0.01, atol=4)
+    assert camera.size_hw == (480, 640)
+    assert camera.distortion[0] == pytest.approx(-0.12, abs=0.04)
+    monkeypatch.setattr(sys, "argv", ["04", *boards, "--corners", "9x6"])
+    with pytest.raises(SystemExit, match="found the board in 0 photographs, needs 3"):
+        runpy.run_path(str(EXAMPLES / "04_calibrate.py"), run_name="__main__")
+
+
+def test_notebook(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    cells = json.loads((EXAMPLES / "05_notebook.ipynb").read_text())["cells"]
+    parameters, *others = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    names: dict = {}
+    exec(parameters, names)
+    assert names["K"] == [600, 600, 320, 240]
+    names |= {"image": "frames/0.png", "mask": "masks/0.png", "K": [300, 300, 160, 120], "settings": SMALL}
+    for source in others:
+        exec(source, names)
+    names["estimator"].close()
+    assert capsys.readouterr().out.startswith("mug: score ")
+    assert (folder / "results" / "notebook" / "pose.html").is_file()
 
 
 # --- ROS 2 -----------------------------------------------------------------------------------------------------------
