@@ -67,7 +67,7 @@ def _bare(backbone: DiffusionBackbone, images: int) -> None:
     unet: Any = model.unet
     step = min(images, backbone.passes.size)
     deepest = unet.up_blocks[3].resnets[2]
-    stop = deepest.register_forward_pre_hook(_reached)
+    stop = deepest.register_forward_pre_hook(_stop_pass)
     try:
         for _ in range(0, images, step):
             with use_deterministic_convolutions():
@@ -78,5 +78,5 @@ def _bare(backbone: DiffusionBackbone, images: int) -> None:
         stop.remove()
 
 
-def _reached(*_: object) -> None:
+def _stop_pass(*_: object) -> None:
     raise _Reached

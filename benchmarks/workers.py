@@ -22,7 +22,7 @@ def two_workers(*, device: str, repeats: int) -> list[Measurement]:
         for workers in (1, 2):
             chosen = (*DATA, f"dataset.root={folder / 'data'}", f"runtime.workers={workers}", "step=estimate")
             found[workers] = run_dzop(folder / str(workers), *chosen, f"runtime.device={device}").wall_s
-        one, two = (_stored(folder / str(workers) / "cache") for workers in (1, 2))
+        one, two = (_read_entries(folder / str(workers) / "cache") for workers in (1, 2))
     if one != two:
         raise AssertionError(f"two workers stored different bytes than one: {sorted(one.items() ^ two.items())[:3]}")
     return [
@@ -32,7 +32,7 @@ def two_workers(*, device: str, repeats: int) -> list[Measurement]:
     ]
 
 
-def _stored(cache: Path) -> dict[str, bytes]:
+def _read_entries(cache: Path) -> dict[str, bytes]:
     """Checksums of the chunks of each entry. Poses are documents without chunks, because their times differ."""
     store = Store(LocalStoreConfig(root=str(cache)))
     return {

@@ -127,12 +127,12 @@ def _draw_items(parts: list[str], items: Sequence[str], width: int, top: float) 
             parts.append(arrow(x + 3, y + height / 2, x + gap - 3, y + height / 2))
             x += gap
         label = text(x + w / 2, y + height / 2 + 5, name)
-        parts.append(_linked(name, box(x, y, w, height, kind="stage") + label) if is_stage else label)
+        parts.append(_link(name, box(x, y, w, height, kind="stage") + label) if is_stage else label)
         x += w
     return y + height
 
 
-def _linked(stage: str, content: str) -> str:
+def _link(stage: str, content: str) -> str:
     return f'<a href="{STAGES}{target(stage)}">{content}</a>'
 
 

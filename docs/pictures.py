@@ -53,8 +53,8 @@ def write_photographs(out: Path, folder: Path, *, views: int) -> None:
     demo = run(folder, "dataset=demo", f"select.images=[{PHOTOGRAPH}]", "gallery=0", views=views)
     save(PIL.Image.open(demo / "overlays" / f"000001_{PHOTOGRAPH:06d}.jpg").resize((800, 600)), out / "demo.jpg")
     card = pose_card(folder, views=views)
-    save(framed(card), out / "method_narrow.jpg")
-    save(framed(landscape(card)), out / "method.jpg")
+    save(frame(card), out / "method_narrow.jpg")
+    save(frame(landscape(card)), out / "method.jpg")
     own = own_object(folder, views=2 * views)
     overlay = PIL.Image.open(own / "overlays" / "000000_000000.jpg")
     save(overlay.crop(MUG_XYXY), out / "own_object.jpg")
@@ -118,7 +118,7 @@ def landscape(card: PIL.Image.Image) -> PIL.Image.Image:
     return page
 
 
-def framed(picture: PIL.Image.Image) -> PIL.Image.Image:
+def frame(picture: PIL.Image.Image) -> PIL.Image.Image:
     """The picture with a white margin, so that its titles do not touch a dark page."""
     page = PIL.Image.new("RGB", (picture.width + 2 * MARGIN_PX, picture.height + 2 * MARGIN_PX), "white")
     page.paste(picture, (MARGIN_PX, MARGIN_PX))

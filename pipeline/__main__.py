@@ -106,10 +106,10 @@ def _exit_message(error: BaseException) -> str | None:
         return f"error: out of memory. {RESUME}"
     if isinstance(error, KeyboardInterrupt):
         return f"{'terminated' if isinstance(error, Terminated) else 'interrupted'}. {RESUME}"
-    return _format_error(error) if _raised_by_hydra(error) else None
+    return _format_error(error) if _comes_from_hydra(error) else None
 
 
-def _raised_by_hydra(error: BaseException) -> bool:
+def _comes_from_hydra(error: BaseException) -> bool:
     """Whether Hydra or its parsers raised an error while reading the command line: some overrides give ValueError."""
     files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
     in_run = any(file.is_relative_to(PACKAGE) and file.name not in READERS for file in files)
@@ -154,7 +154,7 @@ def _run_jobs() -> None:
     jobs = SweepJobs.start()
     try:
         _hydra_main()
-        failed, note = jobs.failed(), same_answers_text(jobs.finished())
+        failed, note = jobs.list_failed(), same_answers_text(jobs.list_finished())
     finally:
         jobs.remove()
     if note:

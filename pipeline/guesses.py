@@ -24,7 +24,7 @@ def trace_guesses(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
         return trace_pose(stages, query, bank)
     found: list[tuple[float, Trace]] = []
     failure, clock = None, Clock()
-    for guess in chain([query], _timed(query.others(), clock)):
+    for guess in chain([query], _time_guesses(query.others(), clock)):
         try:
             trace = trace_pose(stages, guess, bank)
         except NoPose as reason:
@@ -51,7 +51,7 @@ def _similarity(stages: Stages, guess: Query, bank: TemplateBank, trace: Trace) 
     return mean_cosine(trace.best, route.geometry(route.view(trace.best), trace.best.pair))
 
 
-def _timed(guesses: Iterator[Query], clock: Clock) -> Iterator[Query]:
+def _time_guesses(guesses: Iterator[Query], clock: Clock) -> Iterator[Query]:
     """Yield the guesses; add the time to make them to ``clock``."""
     while True:
         with clock("guess mask"):

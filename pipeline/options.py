@@ -38,10 +38,10 @@ class Select:
             if not selected:
                 listed = ", ".join(map(str, available[:MAX_LISTED])) + (", ..." if len(available) > MAX_LISTED else "")
                 raise BadInput(f"select.{name}", found=list(wanted), needed=f"some of the targets' {name}: {listed}")
-        return selected if self.sample is None else self._sampled(selected, self.sample)
+        return selected if self.sample is None else self._sample(selected, self.sample)
 
     @staticmethod
-    def _sampled(targets: tuple[Target, ...], count: int) -> tuple[Target, ...]:
+    def _sample(targets: tuple[Target, ...], count: int) -> tuple[Target, ...]:
         """The targets of ``count`` evenly spaced images."""
         images = sorted({(target.scene_id, target.im_id) for target in targets})
         count = min(count, len(images))

@@ -37,11 +37,11 @@ class SweepJobs:
         os.environ[FOLDER_VARIABLE] = str(folder)
         return cls(folder)
 
-    def failed(self) -> list[tuple[list[str], str]]:
+    def list_failed(self) -> list[tuple[list[str], str]]:
         """Overrides and error message of every failed job."""
         return self._read("failed")
 
-    def finished(self) -> list[tuple[list[str], str]]:
+    def list_finished(self) -> list[tuple[list[str], str]]:
         """Overrides and digest of the answers of every other job that has answers."""
         return self._read("done")
 

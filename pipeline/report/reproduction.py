@@ -41,7 +41,7 @@ def _methods(runs: Sequence[RunRecord]) -> Table | None:
             if mine:
                 run = max(mine, key=lambda run: (len(run.require_scores()), run.at))
                 title = f"{published.DATASETS[dataset]}: {method.name}"
-                rows.append((title, f"{method.ar[dataset]:.3f}", *_measured(run), run.method, _share(run)))
+                rows.append((title, f"{method.ar[dataset]:.3f}", *_format_measured(run), run.method, _share(run)))
     head = ("dataset and method", "published AR", "measured AR", "95 %", "measured with", "instances")
     caption = "Comparison of methods: the paper's AR, and ours on a detector's masks."
     return Table("reproduction_methods", caption, "both", head, tuple(rows)) if rows else None
@@ -56,7 +56,7 @@ def _correspondence(runs: Sequence[RunRecord]) -> Table | None:
     for line, (name, parts) in zip(published.CORRESPONDENCE, PARTS.items(), strict=True):
         assert parts == (line.co_projection, line.clusters, line.sub_pixel)
         run = by_name.get(name)
-        measured = (NOT_AVAILABLE, NOT_AVAILABLE) if run is None else _measured(run)
+        measured = (NOT_AVAILABLE, NOT_AVAILABLE) if run is None else _format_measured(run)
         seconds = NOT_AVAILABLE if run is None else f"{sum(run.times_s.values()):.2f}"
         shown = ", ".join(("co-projection",) * parts[0] + ("clusters",) * parts[1] + ("sub-pixel",) * parts[2])
         rows.append((shown, f"{line.ar:.3f}", *measured, f"{line.time_s:.2f}", seconds))
@@ -77,7 +77,7 @@ def _ablation(runs: Sequence[RunRecord], axis: str) -> Table | None:
     for value, recall in published.ABLATIONS[axis]:
         run = next((run for run in reversed(plain) if _is_point(run, base, axis, value)), None)
         if run is not None:
-            rows.append((f"{value:g}", f"{recall:.4f}", *_measured(run)))
+            rows.append((f"{value:g}", f"{recall:.4f}", *_format_measured(run)))
     head = (axis, "published AR", "measured AR", "95 %")
     caption = f"{axis} on LM-O's ground-truth boxes, {_share(base)} instances."
     name = "reproduction_" + axis.replace(".", "_")
@@ -90,7 +90,7 @@ def _is_point(run: RunRecord, base: RunRecord, axis: str, value: float) -> bool:
     return ours.get(axis) == value and set(difference(settings(base), ours)) <= {axis}
 
 
-def _measured(run: RunRecord) -> tuple[str, str]:
+def _format_measured(run: RunRecord) -> tuple[str, str]:
     """AR and its interval; without depth images the mean of the other two recalls, named as such."""
     scores = run.require_scores()
     interval = ar_interval(scores)

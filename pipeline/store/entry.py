@@ -96,9 +96,9 @@ class Entry:
         try:
             return self._read(name, array, range(array.shape[0]) if rows is None else list(rows))
         except (FileNotFoundError, NotADirectoryError):
-            raise self._damaged(self._describe_loss(name, array)) from None
+            raise self._mark_damaged(self._describe_loss(name, array)) from None
         except READ_ERRORS as error:
-            raise self._damaged(f"array {name} does not pass its checksum ({error})") from None
+            raise self._mark_damaged(f"array {name} does not pass its checksum ({error})") from None
         except OSError as error:
             where = f"{self.backend.place}/{self.ref.path}"
             raise DzopError(f"{where}: array {name} cannot be read ({error.strerror})") from None
@@ -118,7 +118,7 @@ class Entry:
         path = "/".join(filter(None, [self.ref.path, self.record.get("folder", ""), name]))
         array = open_array(ChunkChecker(self.backend.zarr, path, self._checksums(name)), path)
         if array is None or metadata_digest(array) != self.record["arrays"].get(name):
-            raise self._damaged(f"the metadata of array {name} changed after completion")
+            raise self._mark_damaged(f"the metadata of array {name} changed after completion")
         self.checked_arrays[name], self._files[name] = array, ChunkFiles.of(self.backend.folder, array)
         return array
 
@@ -134,6 +134,6 @@ class Entry:
         missing = rows - len(present_rows(self.backend.zarr, array))
         return f"array {name} lacks {missing} of {rows} chunks" if missing else f"array {name} lost a chunk while read"
 
-    def _damaged(self, reason: str) -> DamagedEntry:
+    def _mark_damaged(self, reason: str) -> DamagedEntry:
         self.on_use(self.ref, None)
         return mark_incomplete(self.backend, self.ref, reason, str(self.record["seal"]))

@@ -83,7 +83,7 @@ def test_pictures_repeat_to_the_byte(monkeypatch, tmp_path):
         if name == "second":  # the same scenes, everything else computed again
             shutil.copytree(tmp_path / "first" / "data", tmp_path / "second" / "data")
         card = pictures.pose_card(tmp_path / name, views=12)
-        pictures.save(pictures.framed(pictures.landscape(card)), tmp_path / f"{name}.jpg")
+        pictures.save(pictures.frame(pictures.landscape(card)), tmp_path / f"{name}.jpg")
     assert (tmp_path / "first.jpg").read_bytes() == (tmp_path / "second.jpg").read_bytes()
     assert PIL.Image.open(tmp_path / "first.jpg").size == PIL.Image.open(PICTURES / "method.jpg").size
 

@@ -48,8 +48,8 @@ def check_bounds(path: Path, vertices: Float[np.ndarray, "v 3"], stated: Float[n
     if not np.isfinite(vertices).all() or not np.isfinite(stated).all():
         return  # reported by check_mesh
     if np.abs(actual - stated).max() > _ROUNDING * max(np.ptp(stated, axis=0).max(), np.ptp(actual, axis=0).max()):
-        found = f"vertices from {_shown(actual[0])} to {_shown(actual[1])}"
-        needed = f"those from {_shown(stated[0])} to {_shown(stated[1])} that the file states; export it again"
+        found = f"vertices from {_corner(actual[0])} to {_corner(actual[1])}"
+        needed = f"those from {_corner(stated[0])} to {_corner(stated[1])} that the file states; export it again"
         raise BadInput(path, found=found, needed=needed)
 
 
@@ -59,5 +59,5 @@ def check_count(path: Path, what: str, found: int, stated: int) -> None:
         raise BadInput(path, found=f"{found} {what}", needed=f"{stated}")
 
 
-def _shown(point: Float[np.ndarray, " 3"]) -> str:
+def _corner(point: Float[np.ndarray, " 3"]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"

@@ -91,7 +91,7 @@ class GltfFile:
         accessor = self.list("accessors")[index]
         dtype, width, count = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
         if "bufferView" in accessor:
-            values = self._strided(accessor["bufferView"], accessor.get("byteOffset", 0), dtype, width, count)
+            values = self._read_rows(accessor["bufferView"], accessor.get("byteOffset", 0), dtype, width, count)
         else:
             if not 0 <= count <= _MAX_UNSTORED or "sparse" not in accessor:
                 found = f"accessor {index} of {count} elements without data"
@@ -101,12 +101,12 @@ class GltfFile:
             sparse = accessor["sparse"]
             at, put = sparse["indices"], sparse["values"]
             where = np.dtype(_DTYPES[at["componentType"]])
-            rows = self._strided(at["bufferView"], at.get("byteOffset", 0), where, 1, sparse["count"])[:, 0]
+            rows = self._read_rows(at["bufferView"], at.get("byteOffset", 0), where, 1, sparse["count"])[:, 0]
             values = values.copy()
-            values[rows] = self._strided(put["bufferView"], put.get("byteOffset", 0), dtype, width, sparse["count"])
+            values[rows] = self._read_rows(put["bufferView"], put.get("byteOffset", 0), dtype, width, sparse["count"])
         return values
 
-    def _strided(self, view: int, offset: int, dtype: np.dtype[Any], width: int, count: int) -> np.ndarray:
+    def _read_rows(self, view: int, offset: int, dtype: np.dtype[Any], width: int, count: int) -> np.ndarray:
         data, row = self.view(view), width * dtype.itemsize
         stride = self.list("bufferViews")[view].get("byteStride", row)
         if count < 1 or stride < row or offset < 0 or offset + stride * (count - 1) + row > len(data):
