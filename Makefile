@@ -7,6 +7,8 @@ VENV   := $(or $(VIRTUAL_ENV),.venv)
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.dzop-ready-$(shell pwd | cksum | cut -d' ' -f1)
 ARGS   ?=
+# of torch, OpenMP and OpenBLAS in each of two test processes: more threads than cores wait for one another
+ONE_THREAD := DZOP_TEST_THREADS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
 .PHONY: help setup gl demo photos pictures train-embedded benchmark-embedded confidence ablations sweeps ladder comparison reproduce report bench test test-fast test-faults lint clean
@@ -87,7 +89,7 @@ bench: $(STAMP) ## measure times and compare them with references and targets; A
 	$(PY) -m benchmarks $(ARGS)
 
 test: $(STAMP) gl ## the whole test suite
-	PYOPENGL_PLATFORM=egl DZOP_TEST_THREADS=1 PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(ONE_THREAD) PYOPENGL_PLATFORM=egl PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-fast: $(STAMP) ## the tests that take less than 20 seconds each
 	$(PY) -m pytest -m "not slow and not faults" $(ARGS)
