@@ -64,7 +64,7 @@ ablations: $(STAMP) ## run the paper's ablations on the demo data; ARGS="dataset
 sweeps: $(STAMP) ## run ablations that are not in the paper, on the demo data
 	@$(call sweep,$(OURS))
 
-ladder: $(STAMP) ## run the oracle ladder on the demo data: true mask, true template, true correspondences
+ladder: $(STAMP) ## run the oracle ladder on the demo data: true mask, choice, template, correspondences; ARGS="dataset=lmo ..." for others
 	@$(call sweep,ladder)
 
 confidence: $(STAMP) ## fit the confidence of poses on procedural scenes; ARGS="method=dzop --out dzop.json" for another method

@@ -94,9 +94,8 @@ class Stages:
     @property
     def oracle(self) -> str:
         """The online stage that needs the true pose, such as "match=oracle"; "" where none does."""
-        if self.match.needs_truth:
-            return "match=oracle"
-        return "correspond=oracle" if self.correspond.needs_truth else ""
+        stages = {"match": self.match, "correspond": self.correspond, "choose": self.choose}
+        return next((f"{name}=oracle" for name, stage in stages.items() if stage.needs_truth), "")
 
     @property
     def layers(self) -> tuple[int, ...]:

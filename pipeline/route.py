@@ -200,7 +200,8 @@ class Route:
         if hypothesis.solution is None or hypothesis.pair is None:
             return -1.0
         geometry = self.geometry(self.view(hypothesis), hypothesis.pair)
-        return self.stages.choose(hypothesis.solution.T_cam_obj, hypothesis.inliers, geometry)
+        truth = self.query.truth if self.stages.choose.needs_truth else None
+        return self.stages.choose(hypothesis.solution.T_cam_obj, hypothesis.inliers, geometry, truth)
 
     def refine(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with its pose refined. Inliers stay those of the solver, because the score uses them."""

@@ -15,6 +15,7 @@ from pipeline.graph import Context, Graph
 from pipeline.items.poses import NoEstimate
 from pipeline.items.records import answer_from_record, answer_to_record
 from pipeline.spec import Runtime
+from pipeline.stages.choose.oracle import Oracle as ChooseOracle
 from pipeline.stages.correspond.oracle import Oracle as CorrespondOracle
 from pipeline.stages.extract.coordinates import Coordinates
 from pipeline.stages.match.cosine import Cosine
@@ -23,7 +24,7 @@ from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
 
-ORACLES = {"match": {"match": Oracle()}, "correspond": {"correspond": CorrespondOracle()}}
+ORACLES = {"match": {"match": Oracle()}, "correspond": {"correspond": CorrespondOracle()}, "choose": {"choose": ChooseOracle()}}
 
 
 @pytest.fixture

@@ -95,6 +95,7 @@ def test_a_variation_names_itself_and_changes_only_its_stages(name):
         "no_clusters": {"correspond"},  # the default method has none
         "no_subpixel": {"correspond"},
         "oracle_mask": set(),
+        "oracle_choice": {"choose"},
         "oracle_template": {"match"},
         "oracle_correspondences": {"match", "correspond", "refine", "second_look"},
     }[name]

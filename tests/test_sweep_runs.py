@@ -18,7 +18,7 @@ SD = ("extract=random_sd", "extract.channels=[8,8,8,8]", "extract.vae_channels=[
 SMALL_SD = (*SD, "extract.input_size=64")  # what the command line sets, a sweep does not vary
 FEATURES = dict.fromkeys(("hook", "layers", "noise", "template_layer", "timesteps"), SMALL_SD) | {"input_size": SD}
 JOBS = {
-    "backbones": 6, "clusters": 14, "correspondence": 4, "hook": 3, "input_size": 3, "ladder": 4, "layers": 7,
+    "backbones": 6, "clusters": 14, "correspondence": 4, "hook": 3, "input_size": 3, "ladder": 5, "layers": 7,
     "noise": 6, "pca_dim": 8, "per_cluster": 12, "solver": 2, "template_layer": 4, "theta": 6, "timesteps": 10,
     "top_k": 5, "viewpoints": 2,
 }  # fmt: skip

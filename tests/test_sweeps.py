@@ -193,6 +193,6 @@ def test_a_ladder_of_oracles_climbs(dzop, tmp_path):
     assert dzop("sweep=ladder").status == 0
     rows = read_run_records(tmp_path / "results")
     recall = {row.config["variation"]: row.metrics["AR_MSPD"] for row in rows}
-    assert len(recall) == 4
+    assert len(recall) == 5
     assert recall["oracle_correspondences"] == 1.0
     assert recall["oracle_mask"] == recall["none"]  # the detections are true masks already

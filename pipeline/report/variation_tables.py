@@ -16,10 +16,11 @@ PARTS = {"no_coprojection": (0, 1, 0), "no_clusters": (1, 0, 0), "no_subpixel": 
 _LADDER = {
     "none": "as estimated",
     "oracle_mask": "true mask",
+    "oracle_choice": "true mask, choice of the hypothesis",
     "oracle_template": "true mask, template",
     "oracle_correspondences": "true mask, template, correspondences",
 }
-_SET_BY_VARIATIONS = {"fuse", "cluster", "detect", "match", "correspond"}
+_SET_BY_VARIATIONS = {"fuse", "cluster", "detect", "match", "correspond", "choose"}
 
 
 def correspondence_table(runs: Sequence[RunRecord]) -> Table | None:

@@ -7,9 +7,11 @@ import torch
 from pipeline.errors import BadInput
 from pipeline.functional.agreement import measure_agreement
 from pipeline.items.features import FusedPair, PairGeometry
+from pipeline.items.online import Truth
 from pipeline.spec import build
 from pipeline.stages.choose.agreement import Agreement
 from pipeline.stages.choose.inliers import Inliers
+from pipeline.stages.choose.oracle import Oracle
 
 CELLS, SIZE, FOCAL, FAR = 32, 64, 400.0, 400.0
 K_CROP = np.array([[FOCAL, 0, 31.5], [0, FOCAL, 31.5], [0, 0, 1]])
@@ -124,3 +126,14 @@ def test_the_power_of_the_cosine_is_left_out_of_keys_at_its_earlier_value():
     assert Agreement().recipe() == Agreement(cosine_power=1.0).recipe()
     assert "cosine_power" not in Agreement().recipe()
     assert Agreement(cosine_power=2.0).recipe()["cosine_power"] == 2.0
+
+
+def test_the_oracle_prefers_the_nearest_pose_up_to_symmetry():
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    truth = Truth(pose(), np.stack([np.eye(4), half_turn]))
+    geometry = PairGeometry(pair_of(square()), points(), K_CROP, SIZE)
+    scores = [Oracle()(T, 20, geometry, truth) for T in (pose() @ half_turn, pose(1.0), pose(2.0))]
+    assert scores[0] == pytest.approx(1)
+    assert scores[0] > scores[1] > scores[2] > 0
+    with pytest.raises(BadInput, match="choose=oracle: found features, needs the true pose"):
+        Oracle()(pose(), 20, geometry)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -10,14 +11,22 @@ from jaxtyping import Float
 from pipeline.functional.agreement import measure_agreement
 from pipeline.functional.camera import cell_affine
 from pipeline.items.features import PairGeometry
+from pipeline.items.online import Truth
 from pipeline.spec import Spec
 
 
 class HypothesisScorer(Spec, ABC):
-    """Contract of a choose variant. It never sees ground truth."""
+    """Contract of a choose variant.
+
+    ``needs_truth``: True for oracles, which receive ``truth``; no other variant sees ground truth.
+    """
+
+    needs_truth: ClassVar[bool] = False
 
     @abstractmethod
-    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
+    def __call__(
+        self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry, truth: Truth | None = None
+    ) -> float:
         """Score of a pose (mm), at least 0; higher is better. Never raises NoPose."""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.items.features import PairGeometry
+from pipeline.items.online import Truth
 from pipeline.spec import NonNegativeFloat, PositiveFloat, spec
 from pipeline.stages.choose import HypothesisScorer, compare_features
 
@@ -30,7 +31,9 @@ class Agreement(HypothesisScorer):
     inlier_power: NonNegativeFloat = 0.5
     cosine_power: PositiveFloat = 1.0
 
-    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
+    def __call__(
+        self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry, truth: Truth | None = None
+    ) -> float:
         """The product; 0 where the template lands outside the query's foreground."""
         cosine, coverage = compare_features(T_cam_obj, geometry)
         return max(cosine, 0.0) ** self.cosine_power * coverage * inliers**self.inlier_power

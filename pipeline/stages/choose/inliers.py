@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.items.features import PairGeometry
+from pipeline.items.online import Truth
 from pipeline.spec import spec
 from pipeline.stages.choose import HypothesisScorer
 
@@ -19,6 +20,8 @@ class Inliers(HypothesisScorer):
     kind: ClassVar[str] = "choose.inliers"
     version: ClassVar[int] = 1
 
-    def __call__(self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry) -> float:
+    def __call__(
+        self, T_cam_obj: Float[np.ndarray, "4 4"], inliers: int, geometry: PairGeometry, truth: Truth | None = None
+    ) -> float:
         """The number of inliers."""
         return float(inliers)
