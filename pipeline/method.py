@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -35,17 +36,20 @@ class SecondLook(Spec):
     hypotheses with most correspondences that the first look solves; 0 for all. ``hypotheses``: how many are rendered,
     best first, and compared cell by cell; 0 for none. No hypothesis is rendered whose points lie, on average, within
     ``apart`` times the crop's side of where a better one has them, and none after one whose cells have a mean cosine of
-    ``enough`` with the query's.
+    ``enough`` with the query's. ``outline``: the best pose is fitted, before it is refined, to its matches and to the
+    outline of the detection's mask, which counts this many times as much (functional.outline); 0: off.
     """
 
     kind: ClassVar[str] = "second look"
     version: ClassVar[int] = 3
+    added: ClassVar[Mapping[str, Any]] = {"outline": 0.0}
 
     hypotheses: NonNegative = 0
     block: Positive = 1
     solved: NonNegative = 0
     apart: NonNegativeFloat = 0.0
     enough: Fraction = 1.0
+    outline: NonNegativeFloat = 0.0
 
 
 @spec
@@ -94,8 +98,12 @@ class Stages:
     @property
     def oracle(self) -> str:
         """The online stage that needs the true pose, such as "match=oracle"; "" where none does."""
-        stages = {"match": self.match, "correspond": self.correspond, "choose": self.choose}
-        return next((f"{name}=oracle" for name, stage in stages.items() if stage.needs_truth), "")
+        asks = {
+            "match": self.match.needs_truth,
+            "correspond": self.correspond.needs_truth,
+            "choose": self.choose.needs_truth,
+        }
+        return next((f"{name}=oracle" for name, needs_truth in asks.items() if needs_truth), "")
 
     @property
     def layers(self) -> tuple[int, ...]:

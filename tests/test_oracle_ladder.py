@@ -24,7 +24,11 @@ from pipeline.stages.solve.epnp import Epnp
 from pipeline.store import LocalStoreConfig, Store
 from pipeline.synthetic.scenes import write_dataset
 
-ORACLES = {"match": {"match": Oracle()}, "correspond": {"correspond": CorrespondOracle()}, "choose": {"choose": ChooseOracle()}}
+ORACLES = {
+    "match": {"match": Oracle()},
+    "correspond": {"correspond": CorrespondOracle()},
+    "choose": {"choose": ChooseOracle()},
+}
 
 
 @pytest.fixture
