@@ -23,6 +23,7 @@ from pipeline.fits import fit_arrays, foreground_cells
 from pipeline.functional import camera, rigid
 from pipeline.items.features import Clusters, CropFeatures, FusedPair, PairGeometry
 from pipeline.items.matches import TrueMatches
+from pipeline.items.online import Truth
 from pipeline.items.views import Crops, Geometry
 from pipeline.spec import Runtime, build, digest
 
@@ -161,7 +162,8 @@ def summary(name: str) -> list[float]:
         x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
         points, K_crop = np.stack([x, y, 0 * x], axis=1), np.array([[-400.0, 0, 31.5], [0, 400.0, 31.5], [0, 0, 1]])
         poses = [rigid.rigid(np.eye(3), np.array([shift, 0.0, 400.0])) for shift in (0.0, 3.0, 9.0)]
-        return [spec(T, 25, PairGeometry(pair, points, K_crop, 64)) for T in poses]
+        truth = Truth(poses[1], np.eye(4)[None]) if spec.needs_truth else None
+        return [spec(T, 25, PairGeometry(pair, points, K_crop, 64), truth) for T in poses]
     if stage == "refine":
         pair = toy_pair()
         x, y = (camera.cell_to_px(pair.template_mask.nonzero().flip(1).double(), size=64, cells=16).numpy() - 31.5).T
