@@ -9,9 +9,11 @@ from jaxtyping import Float
 
 from pipeline.functional import camera, rigid
 from pipeline.functional.crop_pose import transfer_template_pose
+from pipeline.functional.outline import fit_outline, outline_px, signed_distance_px
 from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import PairGeometry
 from pipeline.items.online import Hypothesis, Query, TemplateView
+from pipeline.stages.lift import lift
 from pipeline.stages.choose import compare_features
 
 
@@ -52,6 +54,26 @@ def _distance_px(hypothesis: Hypothesis, better: Hypothesis, K_crop: Float[np.nd
     points = better.points_obj[better.solution.inliers]
     px = camera.project(K_crop, rigid.transform(better.solution.T_cam_obj, points))
     return float(reprojection_error_px(points, px, K_crop, hypothesis.solution.T_cam_obj).mean())
+
+
+def fit_to_mask(
+    hypothesis: Hypothesis, query: Query, T_cam_obj: Float[np.ndarray, "4 4"], *, weight: float
+) -> Float[np.ndarray, "4 4"]:
+    """The pose of a rerendered hypothesis fitted to its matches and to the outline of the mask; others as they are.
+
+    The outline is that of the rerendered view, whose pose is so near that the same points of the object form it.
+    ``weight``: of the outline, relative to the matches; 0: the pose as it is.
+    """
+    view, points_obj, px_img = hypothesis.rerendered, hypothesis.points_obj, hypothesis.query_px_img
+    if not weight or view is None or points_obj is None or px_img is None:
+        return T_cam_obj
+    on_object = np.isfinite(points_obj).all(axis=1)
+    matched = points_obj[on_object], camera.apply_homography(query.A_crop_img, px_img[on_object])
+    border_px = outline_px(view.crop.mask.cpu().numpy())
+    outline_obj = lift(border_px, view.A_crop_img, view.depth_mm, view.K, view.T_cam_obj)
+    outline_obj = outline_obj[np.isfinite(outline_obj).all(axis=1)]
+    distance_px = signed_distance_px(query.crop.mask.cpu().numpy())
+    return fit_outline(T_cam_obj, query.K_crop, matched, outline_obj, distance_px, weight=weight)
 
 
 def template_pose(query: Query, template: TemplateView) -> Float[np.ndarray, "4 4"]:

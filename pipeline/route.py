@@ -22,9 +22,8 @@ from pipeline.functional import camera, rigid
 from pipeline.functional.crop_pose import pose_in_image
 from pipeline.functional.maps import upsample
 from pipeline.functional.masks import foreground
-from pipeline.functional.outline import fit_outline, outline_px, signed_distance_px
 from pipeline.functional.pnp import reprojection_error_px
-from pipeline.hypotheses import mean_cosine, select_distinct, select_matched
+from pipeline.hypotheses import fit_to_mask, mean_cosine, select_distinct, select_matched
 from pipeline.items.features import SALIENCY_LAYER, Clusters, FusedPair, PairGeometry
 from pipeline.items.matches import Correspondences, TrueMatches
 from pipeline.items.online import Clock, Hypothesis, Query, TemplateBank, TemplateView, Trace
@@ -211,34 +210,14 @@ class Route:
             return hypothesis
         with self.clock("refine"):
             geometry = self.geometry(self.view(hypothesis), pair)
-            T_cam_obj = self.stages.refine(self.fit_outline(hypothesis, solution.T_cam_obj), geometry)
+            start = fit_to_mask(hypothesis, self.query, solution.T_cam_obj, weight=self.stages.second_look.outline)
+            T_cam_obj = self.stages.refine(start, geometry)
         if np.array_equal(T_cam_obj, solution.T_cam_obj):
             return hypothesis
         points_obj, px_img = hypothesis.points_obj[solution.inliers], hypothesis.query_px_img[solution.inliers]
         error_px = reprojection_error_px(points_obj, px_img, self.query.K, T_cam_obj)
         root_mean_square = float(np.sqrt(np.mean(error_px**2)))
         return replace(hypothesis, solution=PoseSolution(T_cam_obj, solution.inliers, root_mean_square))
-
-    def fit_outline(self, hypothesis: Hypothesis, T_cam_obj: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """The pose of a rerendered hypothesis fitted to its matches and to the outline of the mask; others as they are.
-
-        The drawn outline is that of the first look's pose, so near to the pose's that its points are those in 3D.
-        """
-        look, view = self.stages.second_look, hypothesis.rerendered
-        if not look.outline or view is None or hypothesis.points_obj is None or hypothesis.query_px_img is None:
-            return T_cam_obj
-        on_object = np.isfinite(hypothesis.points_obj).all(axis=1)
-        px_crop = camera.apply_homography(self.query.A_crop_img, hypothesis.query_px_img[on_object])
-        outline = outline_px(view.crop.mask.cpu().numpy())
-        outline_obj = lift(outline, view.A_crop_img, view.depth_mm, view.K, view.T_cam_obj)
-        return fit_outline(
-            T_cam_obj,
-            self.query.K_crop,
-            (hypothesis.points_obj[on_object], px_crop),
-            outline_obj[np.isfinite(outline_obj).all(axis=1)],
-            signed_distance_px(self.query.crop.mask.cpu().numpy()),
-            weight=look.outline,
-        )
 
     def geometry(self, template: TemplateView, pair: FusedPair) -> PairGeometry:
         """The pair with object points of the template's cells and the camera of the query's crop."""
