@@ -13,8 +13,8 @@ from pipeline.functional.outline import fit_outline, outline_px, signed_distance
 from pipeline.functional.pnp import reprojection_error_px
 from pipeline.items.features import PairGeometry
 from pipeline.items.online import Hypothesis, Query, TemplateView
-from pipeline.stages.lift import lift
 from pipeline.stages.choose import compare_features
+from pipeline.stages.lift import lift
 
 
 def select_matched(hypotheses: Sequence[Hypothesis], *, count: int) -> list[Hypothesis]:

@@ -208,3 +208,14 @@ def test_a_joint_fuse_is_coarsened_after_it_and_stores_nothing(scenes, cache):
     made = graph(scenes, cache, render=Raycast(viewpoints="superfibonacci", count=12), second_look=look)
     assert estimates(made)
     assert made.templates.encodings(1) is None
+
+
+def test_the_outline_moves_the_best_pose_alone(scenes, tmp_path):
+    plain, fitted = (
+        estimates(graph(scenes, tmp_path, second_look=SecondLook(hypotheses=2, outline=weight)))
+        for weight in (0.0, 3.0)
+    )
+    assert [e.template_id for e in plain] == [e.template_id for e in fitted]
+    assert any(not np.array_equal(a.T_cam_obj, b.T_cam_obj) for a, b in zip(plain, fitted, strict=True))
+    moved_mm = [np.linalg.norm((a.T_cam_obj - b.T_cam_obj)[:3, 3]) for a, b in zip(plain, fitted, strict=True)]
+    assert np.median(moved_mm) < 10
