@@ -30,6 +30,7 @@ METHODS = {
     "words": ("method=dzop", "extract=embedded", "match=words", "match.count=200", "match.dim=32"),
 }
 SETTINGS = [("runtime.batch=1", "threads=2"), ("runtime.batch=4", "threads=1"), ("runtime.batch=16", "threads=2")]
+COUNT = 19  # crops: whole batches of 4 and 16, and a rest
 
 
 @pytest.fixture(autouse=True)
@@ -103,11 +104,13 @@ def test_features_depend_neither_on_batch_nor_on_threads(name):
     spec, layers = variant(f"extract/{name}"), [2, 11]
     one = toy_crops()
     rng = np.random.default_rng(0)
-    rgb = rng.integers(0, 256, (37, *one.rgb.shape[1:]), dtype=np.uint8) * one.mask[:, :, :, None]
+    rgb = rng.integers(0, 256, (COUNT, *one.rgb.shape[1:]), dtype=np.uint8) * one.mask[:, :, :, None]
     views = Geometry(
-        one.geometry.depth_mm * 37, one.geometry.K.repeat(37, axis=0), one.geometry.T_cam_obj.repeat(37, axis=0)
+        one.geometry.depth_mm * COUNT,
+        one.geometry.K.repeat(COUNT, axis=0),
+        one.geometry.T_cam_obj.repeat(COUNT, axis=0),
     )
-    many = Crops(rgb, one.mask.repeat(37, axis=0), one.A_crop_img.repeat(37, axis=0), views)
+    many = Crops(rgb, one.mask.repeat(COUNT, axis=0), one.A_crop_img.repeat(COUNT, axis=0), views)
 
     def compute(batch: int, threads: int) -> list[bytes]:
         use_threads(threads)
@@ -117,7 +120,7 @@ def test_features_depend_neither_on_batch_nor_on_threads(name):
         return [torch.cat([m[layer] for m in maps]).numpy().tobytes() for layer in layers]
 
     first = compute(1, 1)
-    for batch, threads in ((4, 2), (16, 1), (0, 2), (37, 3)):
+    for batch, threads in ((4, 2), (16, 1), (0, 2), (COUNT, 3)):
         assert compute(batch, threads) == first
 
 
