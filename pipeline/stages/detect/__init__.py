@@ -60,11 +60,11 @@ class SearchPlan(Spec):
     version: ClassVar[int] = 1
 
     proposals: Proposer = field(default_factory=Regions)
-    candidates: Positive = 15
+    candidates: Positive = 30
     colour: NonNegativeFloat = 1.0
     nms_iou: Fraction = 0.6
-    enough: Fraction = 0.9
-    min_confidence: Fraction = 0.5
+    enough: Fraction = 0.95
+    min_confidence: Fraction = 0.9
     doubtful: Fraction = 0.0
 
 
