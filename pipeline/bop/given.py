@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from pipeline.errors import BadInput
 from pipeline.functional.camera import mask_bbox
 from pipeline.functional.camera_diagnosis import denormalize_camera
 from pipeline.io.meshes import prepare_mesh, prepared_digest
-from pipeline.items.objects import ObjectModel
+from pipeline.items.objects import MeshFacts, ObjectModel
 from pipeline.items.views import Detection, Target
 
 MIN_DIAMETER_MM = 2.0
@@ -59,13 +59,16 @@ class MeshFiles:
         path = self.path(obj_id)
         factor = self.factor(obj_id)
         mesh, facts = prepare_mesh(path, scale=factor, simplify=self.simplify)
-        if self.units == "auto" and factor != self.scale:
-            guess = f"taken as metres (units=auto), which makes its diameter {facts.diameter_mm:.4g} mm"
-            facts = replace(facts, warnings=(*facts.warnings, guess))
         if facts.diameter_mm < MIN_DIAMETER_MM:
             found = f"a mesh of diameter {facts.diameter_mm:.3g} (it looks like metres)"
             raise BadInput(path, found=found, needed="millimetres: dataset.scale=1000 converts from metres")
         return ObjectModel(obj_id, mesh, facts.diameter_mm, facts=facts)
+
+    def unit_warning(self, obj_id: int, facts: MeshFacts) -> str:
+        """That a mesh was taken as metres, "" otherwise. Templates do not state it: those of units=m are the same."""
+        if self.units != "auto" or self.factor(obj_id) == self.scale:
+            return ""
+        return f"taken as metres (units=auto), which makes its diameter {facts.diameter_mm:.4g} mm"
 
     def factor(self, obj_id: int) -> float:
         """Millimetres per unit of an object's file."""
@@ -126,6 +129,11 @@ class GivenObjects(Dataset):
     def mesh_digest(self, obj_id: int) -> str:
         """As MeshFiles.digest."""
         return self.meshes.digest(obj_id)
+
+    def model_warning(self, obj_id: int, facts: MeshFacts) -> str:
+        """As MeshFiles.unit_warning, with the mesh's name."""
+        warning = self.meshes.unit_warning(obj_id, facts)
+        return warning and f"mesh of {self.object_name(obj_id)}: {warning}"
 
     def object_model(self, obj_id: int, *, folder: str | None = None) -> ObjectModel:
         """As MeshFiles.model."""

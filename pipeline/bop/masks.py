@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from pycocotools import mask as coco
 
 from pipeline.bop.jsonio import is_number
+from pipeline.functional.boxes import pixels_inside
 
 
 def encode_rle(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
@@ -23,6 +24,17 @@ def encode_rle(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
 def decode_rle(rle: dict[str, Any]) -> Bool[np.ndarray, "H W"]:
     """The mask of an RLE made by ``encode_rle`` or ``read_rle``; the input is not checked."""
     return coco.decode(rle).astype(bool)
+
+
+def pixels_of(
+    rle: dict[str, Any] | None, bbox_xyxy: tuple[float, float, float, float], size_hw: tuple[int, int]
+) -> Bool[np.ndarray, "H W"]:
+    """The pixels of a detection: of its mask as ``encode_rle`` returns it, or of its box if it has none."""
+    if rle is not None:
+        return decode_rle(rle)
+    inside = np.zeros(size_hw, dtype=bool)
+    inside[pixels_inside(bbox_xyxy, size_hw)] = True
+    return inside
 
 
 def read_segmentation(segmentation: Any, size_hw: tuple[int, int]) -> dict[str, Any] | None:

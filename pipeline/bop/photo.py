@@ -88,12 +88,12 @@ class PhotoConfig(Spec):
             raise BadInput(
                 "dataset.mesh", found=found, needed="one mesh, or several without dataset.mask and dataset.bbox"
             )
+        distortion = camera.distortion if self.distortion is None and camera.distortion else self.distortion
         if self.depth is not None:
-            self._check_depth(Path(self.depth).expanduser(), len(photos), size_hw)
+            self._check_depth(Path(self.depth).expanduser(), len(photos), size_hw, distorted=distortion is not None)
         labels = len(self.mask_label) if isinstance(self.mask_label, tuple) else 1
         counts = [max(1, len(found)) * labels for found in masks] or [1] * len(photos)
         objects = range(1, len(meshes) + 1)
-        distortion = camera.distortion if self.distortion is None and camera.distortion else self.distortion
         return Photo(
             name=self.name,
             root=photos[0].parent,
@@ -150,7 +150,7 @@ class PhotoConfig(Spec):
             return (), xyxy_from_xywh(numbers)
         return ((), None) if self.mask is None else (_pair_masks(find_files(self.mask, "dataset.mask"), photos), None)
 
-    def _check_depth(self, path: Path, photos: int, size_hw: tuple[int, int]) -> None:
+    def _check_depth(self, path: Path, photos: int, size_hw: tuple[int, int], *, distorted: bool) -> None:
         """Raise BadInput for a depth image of another size, and for depth together with ``distortion``."""
         if photos > 1:
             raise BadInput("dataset.depth", found=f"one depth image for {photos} photographs", needed="one photograph")
@@ -158,8 +158,11 @@ class PhotoConfig(Spec):
         if found != size_hw:
             needed = f"those of the photograph, {w} x {h} (width x height): register depth to colour first"
             raise BadInput(path, found=f"{found[1]} x {found[0]} pixels", needed=needed)
-        if self.distortion is not None:
-            raise BadInput("dataset.depth", found="with dataset.distortion", needed="an undistorted pair of images")
+        if distorted:
+            found = (
+                "with dataset.distortion" if self.distortion is not None else "with a camera file that has distortion"
+            )
+            raise BadInput("dataset.depth", found=found, needed="an undistorted pair of images")
 
 
 def find_files(given: str | tuple[str, ...], where: str) -> tuple[Path, ...]:

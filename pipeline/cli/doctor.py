@@ -21,14 +21,13 @@ from pipeline.bop.symmetries import mesh_symmetries
 from pipeline.errors import DzopError
 from pipeline.functional.boxes import pixels_inside
 from pipeline.functional.camera_diagnosis import diagnose_camera
+from pipeline.functional.plausibility import diagnose_contrast, diagnose_distance, distance_text, estimate_distance
 from pipeline.functional.surface import signed_volume
 from pipeline.io.meshes import prepare_mesh
 from pipeline.items.objects import Mesh, MeshFacts
 
 Level = Literal["ok", "note", "warning", "error"]
 MANY_FACES, FEW_PIXELS, FAR_ORIGIN = 1_000_000, 1000, 1.5
-NEAR_MM, FAR_MM = 60.0, 10_000.0  # plausible distances of an object that a robot is to pick
-FLAT = 1e-3  # smallest over largest side of the bounding box; below this, a mesh counts as a sheet
 DARK, BRIGHT = 25.0, 235.0
 MOST_INSIDE = 0.9  # share of a box inside the image, below which it may be two corners
 FEWEST_MEASURED = 0.2  # share of an object's pixels with a depth
@@ -102,15 +101,8 @@ def examine(
 
 def examine_mesh(mesh: Mesh, facts: MeshFacts, scale: float) -> Iterator[Finding]:
     """Unit, size, origin, winding, colours, faces and symmetry of a mesh."""
-    d, sides = facts.diameter_mm, np.ptp(mesh.vertices, axis=0)
+    d = facts.diameter_mm
     yield _examine_unit(d, scale)
-    if sides.min() < FLAT * sides.max():
-        yield Finding(
-            "warning",
-            "shape",
-            f"flat: {_sides(sides)} mm",
-            "use a mesh with thickness; a sheet cannot be seen from behind",
-        )
     centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     away = float(np.linalg.norm(centre)) / d
     if away > FAR_ORIGIN:
@@ -163,6 +155,8 @@ def _examine_photograph(photo: Photo, size_hw: tuple[int, int], diameter_mm: flo
         mask = np.ones(size_hw, dtype=bool)
     located = bool(mask.any()) and not mask.all()
     distance_mm = _implied_distance(photo, mask, diameter_mm) if located and diameter_mm is not None else None
+    if located and (text := diagnose_contrast(photo.image(0, 0).rgb, mask)):
+        yield Finding("warning", "image", text, "change the exposure, or take another photograph")
     if distance_mm is not None:
         yield _examine_distance(distance_mm, "mask" if photo.masks else "box")
     if photo.gives_depth and mask.any():
@@ -236,28 +230,19 @@ def _implied_distance(photo: Photo, mask: Bool[np.ndarray, "H W"], diameter_mm: 
     """The distance, mm, at which an object of this diameter appears as large as the mask; if occluded, it is nearer."""
     rows, columns = np.nonzero(mask)
     longest_px = float(np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1))
-    return float(photo.camera_matrix[0, 0]) * diameter_mm / longest_px
+    return estimate_distance(diameter_mm, float(photo.camera_matrix[0, 0]), longest_px)
 
 
 def _examine_distance(distance_mm: float, located_by: str) -> Finding:
-    """Whether the distance is plausible for an object that a robot is to pick."""
-    text = f"mesh, K and {located_by} give a distance of about {distance_mm / 1000:.3g} m"
-    if NEAR_MM <= distance_mm <= FAR_MM:
-        return Finding("ok", "distance", text)
-    factors = {"metres": 1000.0, "inches": 25.4, "centimetres": 10.0}
-    fitting = [name for name, f in factors.items() if NEAR_MM * 3 <= distance_mm * f <= FAR_MM / 3]
-    remedy = f"check K; or is the mesh in {' or '.join(fitting)}?" if fitting else "check K and the mesh's unit"
-    return Finding("warning", "distance", text, remedy)
+    """Whether a photograph is taken from this distance."""
+    remedy = diagnose_distance(distance_mm)
+    return Finding("warning" if remedy else "ok", "distance", distance_text(distance_mm, located_by), remedy)
 
 
 def _count_pieces(mask: Bool[np.ndarray, "H W"]) -> int:
     """Number of connected parts with at least 1 % of the mask's pixels."""
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     return int((stats[1:, cv2.CC_STAT_AREA] >= mask.sum() / 100).sum())
-
-
-def _sides(sides: np.ndarray) -> str:
-    return " x ".join(f"{side:.4g}" for side in sides)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bop.masks import decode_rle
+from pipeline.bop.masks import decode_rle, pixels_of
 from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import diagnose_camera
+from pipeline.functional.plausibility import diagnose_contrast, diagnose_distance, distance_text, estimate_distance
 from pipeline.graph.context import Context, ImageId
 from pipeline.items.features import CLASS_FACET_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.objects import MeshFacts
@@ -86,6 +87,48 @@ def detection_warnings(context: Context, detections: Sequence[Detection]) -> lis
         if d.defect is None and (problem := _check_detection(context, d)):
             image, name = context.dataset.image_name(d.scene_id, d.im_id), context.dataset.object_name(d.obj_id)
             warnings.append(f"{image}, {name}: {problem}")
+    return warnings + _contrast_warnings(context, detections)
+
+
+def distance_warnings(
+    context: Context, detections: Sequence[Detection], facts_of: Callable[[int], MeshFacts]
+) -> list[str]:
+    """One line per object whose mesh, K and first mask or box give a distance that no photograph is taken from.
+
+    The usual cause is a mesh that is not in millimetres. Without ground truth only, which shows the distances.
+    """
+    firsts: dict[int, Detection] = {}
+    for d in detections:
+        x0, y0, x1, y1 = d.bbox_xyxy
+        is_tiny = (x1 - x0) * (y1 - y0) < MIN_PIXELS
+        if d.defect is None and not is_tiny and not context.dataset.has_ground_truth(d.scene_id):
+            firsts.setdefault(d.obj_id, d)
+    warnings = []
+    for obj_id, d in firsts.items():
+        x0, y0, x1, y1 = d.bbox_xyxy
+        focal_px = float(context.K((d.scene_id, d.im_id))[0, 0])
+        distance_mm = estimate_distance(facts_of(obj_id).diameter_mm, focal_px, float(np.hypot(x1 - x0, y1 - y0)))
+        if problem := diagnose_distance(distance_mm):
+            located_by = "box" if d.rle is None else "mask"
+            where = f"{context.dataset.image_name(d.scene_id, d.im_id)}, {context.dataset.object_name(obj_id)}"
+            warnings.append(f"{where}: {distance_text(distance_mm, located_by)}: {problem}")
+    return warnings
+
+
+def _contrast_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:
+    """One line per detection in the user's own photographs whose pixels show nothing."""
+    if not context.dataset.requires_pose:
+        return []
+    warnings = []
+    for image in dict.fromkeys((d.scene_id, d.im_id) for d in detections if d.defect is None):
+        rgb = context.dataset.image(*image).rgb
+        for d in detections:
+            if d.defect is not None or (d.scene_id, d.im_id) != image:
+                continue
+            pixels = pixels_of(d.rle, d.bbox_xyxy, (rgb.shape[0], rgb.shape[1]))
+            if pixels.sum() >= MIN_PIXELS and (problem := diagnose_contrast(rgb, pixels)):
+                where = f"{context.dataset.image_name(*image)}, {context.dataset.object_name(d.obj_id)}"
+                warnings.append(f"{where}: {problem}")
     return warnings
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from pipeline.errors import BadInput
-from pipeline.graph.checks import check_layers, detection_warnings, mesh_warnings
+from pipeline.graph.checks import check_layers, detection_warnings, distance_warnings, mesh_warnings
 from pipeline.graph.context import Context
 from pipeline.graph.detections import DetectionNodes
 from pipeline.graph.memory import Memory, estimate_peak, fit_to_budgets
@@ -94,7 +94,8 @@ class Graph:
 
     def warnings(self) -> list[str]:
         """Results of sanity checks on dataset, detections, cameras and meshes, one line each."""
-        return self.detection_warnings() + self.mesh_warnings()
+        distances = distance_warnings(self.context, self.detect(), self.templates.mesh_facts)
+        return self.detection_warnings() + self.mesh_warnings() + distances
 
     def mesh_warnings(self) -> list[str]:
         """Results of sanity checks on meshes. A mesh is read only if its templates are missing."""

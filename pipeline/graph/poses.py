@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.bop.masks import decode_rle
+from pipeline.bop.masks import pixels_of
 from pipeline.bop.symmetries import SYMMETRIES_VERSION
 from pipeline.confidence.evidence import collect_evidence
 from pipeline.errors import NoPose
-from pipeline.functional.boxes import pixels_inside
 from pipeline.functional.depth_fit import fit_depth
 from pipeline.functional.symmetry import make_canonical
 from pipeline.graph.bank import StoredBank
@@ -294,11 +293,7 @@ class PoseNodes:
         """The pose fitted to the depth image inside the detection, and a note that says so."""
         context, image = self.context, (d.scene_id, d.im_id)
         depth_mm, K, model = context.dataset.depth_mm(*image), context.K(image), context.model(d.obj_id)
-        if d.rle is None:
-            mask = np.zeros(depth_mm.shape, dtype=bool)
-            mask[pixels_inside(d.bbox_xyxy, depth_mm.shape)] = True
-        else:
-            mask = decode_rle(d.rle)
+        mask = pixels_of(d.rle, d.bbox_xyxy, (depth_mm.shape[0], depth_mm.shape[1]))
 
         def render(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "H W"]:
             return render_depth(model.mesh, K, T[None], depth_mm.shape)[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
     A reader sees all of the old content or all of the new. Raises DzopError when the disk is full or read-only.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.{unique_suffix()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -51,6 +52,11 @@ def write_atomic(path: Path, content: str | bytes) -> None:
             partial.unlink(missing_ok=True)
     except OSError as error:
         raise write_error(path, error) from None
+
+
+def unique_suffix() -> str:
+    """Part of a temporary file's name that no other writer has: threads share a process id, and containers may."""
+    return f"{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def write_error(path: Path, error: OSError) -> DzopError:

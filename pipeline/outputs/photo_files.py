@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from os import PathLike
@@ -12,9 +11,11 @@ from typing import Any
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from pipeline.io.files import write_atomic, write_json
+from pipeline.bop.jsonio import read_json
+from pipeline.errors import BadInput
+from pipeline.io.files import unique_suffix, write_atomic, write_error, write_json
 from pipeline.outputs.pose_result import PoseResult, draw_results
-from pipeline.report.overlay import write_overlay
+from pipeline.report.overlay import shows, write_overlay
 from pipeline.report.pose_page import PosePage, ShownPose
 from pipeline.report.scene_page import scene_html
 
@@ -37,36 +38,64 @@ def save_results(
     cards: Callable[[], Cards] | None = None,
     note: str = "",
 ) -> list[Path]:
-    """Write results of one image to a folder: pose.json, and with ``overlay`` overlay.jpg and pose.html.
+    """Write results of one image to a folder: with ``overlay`` overlay.jpg and pose.html, and last pose.json.
 
     ``image``: the photograph's file. ``more``: further fields of pose.json. ``cards``: draws the figures of
     how each pose was found, for the page. ``note``: how the photograph was changed. Returns the files. Raises
     DzopError.
     """
-    to = Path(folder)
-    files = [_write_json(to, results, image=image, more=more or {})]
+    to, made_from = Path(folder), str((more or {}).get("made_from", ""))
+    pictures = [to / "overlay.jpg", to / "pose.html"]
     if overlay:
         drawn = draw_results(results)
-        write_overlay(to / "overlay.jpg", drawn)
         page = _page(results, drawn, title=image or to.name, cards=cards() if cards else (), note=note)
-        write_atomic(to / "pose.html", page.html())
-        files += [to / "overlay.jpg", to / "pose.html"]
-    return files
+        write_overlay(pictures[0], drawn, made_from=made_from or None)
+        write_atomic(pictures[1], page.html() + _mark(made_from))
+    else:
+        _remove(pictures)  # of other results, which pose.json would seem to describe
+    _write_json(to, results, image=image, more=more or {})
+    return [to / "pose.json", *(pictures if overlay else [])]
+
+
+def holds_results(folder: Path, made_from: str, *, overlay: bool) -> bool:
+    """Whether ``save_results`` has written all files of a folder with this ``made_from`` as a field of pose.json."""
+    try:
+        record = read_json(folder / "pose.json")
+        if not isinstance(record, dict) or record.get("made_from") != made_from:
+            return False
+        if not overlay:
+            return True
+        page = (folder / "pose.html").read_text()
+    except (BadInput, OSError, ValueError):
+        return False
+    return page.endswith(_mark(made_from)) and shows(folder / "overlay.jpg", made_from)
+
+
+def _mark(made_from: str) -> str:
+    """The end of a page, which says what it was made from."""
+    return f"<!-- {made_from} -->\n" if made_from else ""
+
+
+def _remove(files: Sequence[Path]) -> None:
+    for path in files:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise write_error(path, error) from None
 
 
 def link_latest(folder: Path) -> None:
     """Link ``latest``, beside the folder, to it, if the file system supports symbolic links."""
     link = folder.parent / LATEST
-    new = folder.parent / f".{LATEST}.{os.getpid()}.partial"
+    new = folder.parent / f".{LATEST}.{unique_suffix()}.partial"
     if link.exists() and not link.is_symlink():
         return
     with suppress(OSError):
-        new.unlink(missing_ok=True)
         new.symlink_to(folder.name, target_is_directory=True)
         new.replace(link)
 
 
-def _write_json(folder: Path, results: Sequence[PoseResult], *, image: str, more: dict[str, Any]) -> Path:
+def _write_json(folder: Path, results: Sequence[PoseResult], *, image: str, more: dict[str, Any]) -> None:
     shown = results[0].image
     record = {
         "image": image,
@@ -78,7 +107,6 @@ def _write_json(folder: Path, results: Sequence[PoseResult], *, image: str, more
         "poses": [result.to_record() for result in results],
     }
     write_json(folder / "pose.json", record)
-    return folder / "pose.json"
 
 
 def _page(results: Sequence[PoseResult], drawn: ndarray, *, title: str, cards: Cards, note: str) -> PosePage:

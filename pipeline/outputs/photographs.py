@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from pipeline.bop.jsonio import read_json
-from pipeline.errors import BadInput
 from pipeline.graph.context import ImageId
+from pipeline.items.poses import PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.outputs.folder import OutputFolder
-from pipeline.outputs.photo_files import LATEST, Cards, link_latest, save_results
+from pipeline.outputs.photo_files import LATEST, Cards, holds_results, link_latest, save_results
 from pipeline.outputs.pictures import Pictures
-from pipeline.outputs.pose_result import PoseResult, result_of
+from pipeline.outputs.pose_result import PoseResult, describe_doubt, result_of
+from pipeline.spec import digest
 
 FILES_VERSION = 3
 """Raise it when the files written for the same results change."""
@@ -55,9 +55,8 @@ class Photographs:
         data, folders = self.folder.context.dataset, []
         for image, indices in by_image.items():
             folder = self.folder.out / self._folder_name(image)
-            more = {"run": str(self.folder.path), "made_from": f"{FILES_VERSION} {self.pictures.made_from}"}
-            wanted = ["pose.json", *(["overlay.jpg", "pose.html"] if overlays else [])]
-            if not _holds(folder, wanted, more["made_from"]):
+            more = {"run": str(self.folder.path), "made_from": self._made_from(image, indices, cards=cards)}
+            if not holds_results(folder, more["made_from"], overlay=overlays):
                 save_results(
                     [self._with_model(index) for index in indices],
                     folder,
@@ -72,6 +71,13 @@ class Photographs:
             link_latest(folders[-1])
         return folders
 
+    def _made_from(self, image: ImageId, indices: Sequence[int], *, cards: bool) -> str:
+        """Digest of what the files of a photograph show: its poses, and what is not in their keys."""
+        data = self.folder.context.dataset
+        named = [[self.results[index].name, self.results[index].mesh] for index in indices]
+        shown = [str(data.image_path(*image)), str(self.folder.path), named, list(self.warnings), cards]
+        return digest([FILES_VERSION, self.pictures.made_from, shown])
+
     def text(self) -> str:
         """One line per result, with the photograph's name if there are several."""
         data, several = self.folder.context.dataset, len(self.folder.context.image_ids) > 1
@@ -81,6 +87,8 @@ class Photographs:
             lines.append(f"{image}{result.summary()}")
             if result.found:
                 lines.append(f"  {result.inliers} of {result.correspondences} matches agree{result.details()}")
+            if isinstance(answer, PoseEstimate):
+                lines += [f"warning: {image}{doubt}" for doubt in describe_doubt(answer, result.name)]
         return "\n".join(lines)
 
     def _with_model(self, index: int) -> PoseResult:
@@ -97,14 +105,3 @@ class Photographs:
 
     def _cards(self, indices: Sequence[int]) -> Cards:
         return [self.pictures.draw_card(index) for index in indices]
-
-
-def _holds(folder: Path, names: Sequence[str], made_from: str) -> bool:
-    """Whether all files are there and pose.json was made from these results."""
-    if not all((folder / name).is_file() for name in names):
-        return False
-    try:
-        record = read_json(folder / "pose.json")
-    except BadInput:
-        return False
-    return isinstance(record, dict) and record.get("made_from") == made_from

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from pipeline.items.objects import ObjectModel
-from pipeline.items.poses import Alternative, NoEstimate
+from pipeline.items.poses import Alternative, NoEstimate, PoseEstimate
 from pipeline.items.records import Answer
 from pipeline.items.views import Image
 from pipeline.report.overlay import DrawnPose, draw_overlay
@@ -131,7 +131,7 @@ def result_of(
         confidence=answer.confidence,
         decision=answer.decision or None,
         alternatives=answer.alternatives,
-        warnings=tuple(warnings),
+        warnings=(*warnings, *describe_doubt(answer, name)),
         inliers=answer.inliers,
         correspondences=answer.correspondences,
         reprojection_px=answer.reprojection_px,
@@ -140,6 +140,17 @@ def result_of(
         image=image,
         model=model,
     )
+
+
+def describe_doubt(estimate: PoseEstimate, name: str) -> tuple[str, ...]:
+    """One line for a pose that is not to be used as it is: what to check."""
+    sure = "" if estimate.confidence is None else f" (confidence {estimate.confidence:.2f})"
+    if estimate.decision == "check":
+        return (f"{name}: this pose may be wrong{sure}: look at the overlay before you use it",)
+    if estimate.decision == "reject":
+        causes = "mask and photograph that do not belong together, another object's mesh, a wrong unit or K"
+        return (f"{name}: this pose is probably wrong{sure}: likely causes are a hidden object, {causes}",)
+    return ()
 
 
 def draw_results(results: Sequence[PoseResult]) -> UInt8[np.ndarray, "H W 3"]:

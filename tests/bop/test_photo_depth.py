@@ -1,6 +1,7 @@
 """dataset.depth: the depth image of an own photograph."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import PIL.Image
@@ -25,6 +26,11 @@ def test_depth_of_another_size_or_with_distortion_is_refused(tmp_path):
         config(root, depth=str(small)).open()
     with pytest.raises(BadInput, match=r"dataset.depth: found with dataset.distortion"):
         config(root, depth=str(root / SCENE / "depth" / "000000.png"), distortion=(-0.05, 0.0, 0.0, 0.0)).open()
+    matrix = [[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]
+    (tmp_path / "camera.json").write_text(json.dumps({"camera_matrix": matrix, "dist_coeffs": [-0.05, 0, 0, 0]}))
+    given = config(root, depth=str(root / SCENE / "depth" / "000000.png"))
+    with pytest.raises(BadInput, match=r"dataset.depth: found with a camera file that has distortion"):
+        replace(given, K=str(tmp_path / "camera.json")).open()
 
 
 def test_depth_is_read_in_millimetres_and_used_where_it_is_given(tmp_path):

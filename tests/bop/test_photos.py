@@ -156,6 +156,8 @@ def test_units_of_a_mesh(folder):
         model = photo.object_model(1)
         assert model.diameter_mm == pytest.approx(factor * diameter, rel=1e-4)
         assert photo.mesh_digest(1) == model.mesh.digest
-        assert any("taken as metres" in text for text in model.facts.warnings) == (name == "metres")
-    metres = config(folder, mesh=str(folder / "metres.ply"), units="m").open().object_model(1)
-    assert metres.diameter_mm == pytest.approx(diameter, rel=1e-4)
+        assert ("taken as metres" in photo.model_warning(1, model.facts)) == (name == "metres")
+    metres = config(folder, mesh=str(folder / "metres.ply"), units="m").open()
+    assert metres.object_model(1).diameter_mm == pytest.approx(diameter, rel=1e-4)
+    assert metres.model_warning(1, metres.object_model(1).facts) == ""
+    assert metres.object_model(1).facts == model.facts  # they share templates, which keep the facts

@@ -10,13 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.errors import DzopError
 from pipeline.functional.rigid import rigid
 from pipeline.io.meshes.simplify import thin_mesh
 from pipeline.items.objects import Mesh, ObjectModel
-from pipeline.items.poses import Alternative
+from pipeline.items.poses import Alternative, PoseEstimate
 from pipeline.items.views import Image
-from pipeline.outputs.photo_files import link_latest, save_results
-from pipeline.outputs.pose_result import PoseResult
+from pipeline.outputs import photo_files
+from pipeline.outputs.photo_files import holds_results, link_latest, save_results
+from pipeline.outputs.pose_result import PoseResult, describe_doubt
 from pipeline.report.pose_page import MAX_BYTES, PosePage, ShownPose
 from pipeline.synthetic.objects import make_object
 
@@ -83,6 +85,68 @@ def test_other_poses_are_in_the_file_and_on_the_page(tmp_path):
     assert (pose["confidence"], pose["decision"]) == (0.6, "check")
     (other,) = pose["alternatives"]
     assert (other["T_cam_obj"], other["support"], other["weight"]) == (T.tolist(), 0.9, 0.3)
+
+
+@pytest.mark.parametrize("name", ["overlay.jpg", "pose.html", "pose.json"])
+def test_a_write_that_fails_leaves_no_mixture_that_counts_as_finished(tmp_path, monkeypatch, name):
+    shown = {"overlay": True}
+    save_results([result()], tmp_path, more={"made_from": "first"})
+    assert holds_results(tmp_path, "first", **shown)
+
+    def fail(path: Path, *given, **more):
+        if path.name == name:
+            raise DzopError("the disk is full")
+        return whole[name](path, *given, **more)
+
+    writers = {"overlay.jpg": "write_overlay", "pose.html": "write_atomic", "pose.json": "write_json"}
+    whole = {name: getattr(photo_files, writers[name])}
+    with monkeypatch.context() as patch:
+        patch.setattr(photo_files, writers[name], fail)
+        with pytest.raises(DzopError):
+            save_results([result(score=0.5)], tmp_path, more={"made_from": "second"})
+    assert not holds_results(tmp_path, "second", **shown)
+    assert holds_results(tmp_path, "first", **shown) == (name == "overlay.jpg")
+    save_results([result(score=0.5)], tmp_path, more={"made_from": "second"})
+    assert holds_results(tmp_path, "second", **shown)
+
+
+def test_pictures_of_other_results_do_not_stay_beside_a_new_pose(tmp_path):
+    save_results([result()], tmp_path, more={"made_from": "first"})
+    save_results([result(score=0.5)], tmp_path, more={"made_from": "second"}, overlay=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["pose.json"]
+    assert holds_results(tmp_path, "second", overlay=False)
+    assert not holds_results(tmp_path, "second", overlay=True)
+
+
+def test_two_writers_of_one_folder_leave_what_a_later_run_recognises_as_mixed(tmp_path):
+    save_results([result()], tmp_path / "one", more={"made_from": "first"})
+    save_results([result(score=0.5)], tmp_path / "two", more={"made_from": "second"})
+    for name in ("overlay.jpg", "pose.html", "pose.json"):
+        mixed = tmp_path / f"mixed {name}"
+        shutil.copytree(tmp_path / "one", mixed)
+        shutil.copy(tmp_path / "two" / name, mixed / name)
+        assert not holds_results(mixed, "first", overlay=True)
+        assert not holds_results(mixed, "second", overlay=True)
+
+
+def estimate(**given) -> PoseEstimate:
+    return PoseEstimate(0, 0, 1, 0, T, 0.5, 1.0, 3, 0.8, 0.1, 10, 9, 1.5, **given)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"confidence": 0.95, "decision": "accept"}, ()),
+        ({}, ()),
+        ({"confidence": 0.5, "decision": "check"}, ("mug: this pose may be wrong (confidence 0.50)",)),
+        ({"confidence": 0.04, "decision": "reject"}, ("mug: this pose is probably wrong (confidence 0.04)",)),
+        ({"decision": "reject"}, ("mug: this pose is probably wrong: likely causes",)),
+    ],
+)
+def test_a_doubtful_pose_is_said_in_words(given, said):
+    lines = describe_doubt(estimate(**given), "mug")
+    assert len(lines) == len(said)
+    assert all(line.startswith(text) for line, text in zip(lines, said, strict=True))
 
 
 def test_latest_points_to_the_last_folder_and_never_replaces_one_of_the_users(tmp_path):

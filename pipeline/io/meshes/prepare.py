@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.functional.plausibility import diagnose_shape
 from pipeline.io.meshes.diameter import diameter_mm
 from pipeline.io.meshes.reading import identify_mesh, read_mesh
 from pipeline.io.meshes.simplify import SIMPLIFY_VERSION, simplify_mesh
@@ -30,6 +31,8 @@ def prepare_mesh(path: Path, *, scale: float = 1.0, simplify: int | None = None)
     warnings = mesh.warnings
     if mesh.colours is None and mesh.texture is None:
         warnings += (NO_COLOURS,)
+    if problem := diagnose_shape(mesh.vertices[np.bincount(mesh.faces.reshape(-1), minlength=len(mesh.vertices)) > 0]):
+        warnings += (problem,)
     warnings += describe_stray_faces(mesh)
     if simplify is not None and len(mesh.faces) > simplify:
         mesh, note = simplify_mesh(mesh, simplify, diameter)
