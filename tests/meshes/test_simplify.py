@@ -89,6 +89,22 @@ def test_colours_of_flat_surfaces_survive():
     assert "which moves its surface by up to" in note
 
 
+def test_colours_of_a_few_faces_are_those_of_the_nearest_surface():
+    """Far from the samples a thinned set of them is searched; near them, all."""
+    ball = trimesh.creation.icosphere(4, 50.0)
+    side = (ball.vertices[:, 0] > 0).astype(np.uint8) * np.uint8(200)
+    colours = np.stack([side, 200 - side, side * 0], axis=-1)
+    look = bake._Colours(Mesh(ball.vertices, ball.faces, colours=colours))
+    normals = np.random.default_rng(0).normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[np.abs(normals[:, 0]) > 0.15]  # the colours blend along the seam
+    for radius in (20.0, 45.0, 50.0, 70.0):
+        found = look(radius * normals, normals)
+        assert ((found[:, 0] > found[:, 1]) == (normals[:, 0] > 0)).mean() > 0.99
+    near = look._join(50.0 * normals, normals)
+    assert np.array_equal(look(50.0 * normals, normals), look._colours[look._tree.query(near)[1]])
+
+
 def test_seams_do_not_open():
     """Copies of a vertex, on seams or between facets as in stl files, are one vertex when edges collapse."""
     ball = trimesh.creation.icosphere(4, radius=50)

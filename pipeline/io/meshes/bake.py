@@ -17,6 +17,7 @@ _TEXELS = 500_000  # texels for the surface's area; blocks need about five times
 _WIDTH, _MAX_HEIGHT = 4096, 8192
 _MIN_BLOCK, _MAX_BLOCK = 4, 1024
 _FACING = 4.0  # distance, in sample spacings, that a unit of difference between normals adds
+_FAR, _FAR_EVERY = 6.0, 64  # a point is far at this many spacings; every 64th sample is 8 spacings from the next
 _CHUNK = 1 << 18
 
 
@@ -120,11 +121,23 @@ class _Colours:
         self._colours = _sample_colours(mesh, samples, self._spacing)
         normals = _unit(face_normals(mesh.vertices, mesh.faces[samples.face]))
         points = samples.interpolate(mesh.vertices, mesh.faces)
-        self._tree = cKDTree(self._join(points, normals), balanced_tree=False)
+        places = self._join(points, normals)
+        self._tree = cKDTree(places, balanced_tree=False)
+        self._every = _FAR_EVERY if len(places) > _FAR_EVERY else 1
+        self._far_tree = cKDTree(places[:: self._every], balanced_tree=False)
 
     def __call__(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-        """The colour of the nearest sample, where a different normal adds to the distance."""
-        return self._colours[self._tree.query(self._join(points, normals), workers=worker_count())[1]]
+        """The colour of the nearest sample, where a different normal adds to the distance.
+
+        Points far from all samples are looked up among every 64th: the exact search would visit most samples, because
+        all of them are about equally far away.
+        """
+        places, threads = self._join(points, normals), worker_count()
+        distance, index = self._tree.query(places, distance_upper_bound=_FAR * self._spacing, workers=threads)
+        far = np.isinf(distance)
+        if far.any():
+            index[far] = self._every * self._far_tree.query(places[far], workers=threads)[1]
+        return self._colours[index]
 
     def _join(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"]:
         return np.concatenate([points, _FACING * self._spacing * normals], axis=-1)

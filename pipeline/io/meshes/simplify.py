@@ -14,7 +14,7 @@ from pipeline.functional.surface import spread_points, surface_distance
 from pipeline.io.meshes.bake import bake_texture
 from pipeline.items.objects import Mesh
 
-SIMPLIFY_VERSION = f"1, fast-simplification {version('fast-simplification')}"
+SIMPLIFY_VERSION = f"2, fast-simplification {version('fast-simplification')}"
 _MEASURED = 100_000  # points per surface at which the distance to the other one is measured
 _WELD = 1e-7  # share of the mesh's largest side: closer vertices are merged, or seams would tear open
 
