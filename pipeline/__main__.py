@@ -32,7 +32,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from pipeline.cli.termination import Terminated, stop_children, stop_on_signals
+from pipeline.cli.termination import Terminated, WorkerLost, stop_children, stop_on_lost_workers, stop_on_signals
 from pipeline.errors import BadInput, DzopError
 from pipeline.io.digests import track_files
 from pipeline.places import CONF, PACKAGE
@@ -61,7 +61,7 @@ def main() -> None:
     _silence_resource_trackers()
     logging.raiseExceptions = False  # no traceback when Hydra logs a sweep's job to a closed pipe
     try:
-        with stop_on_signals():
+        with stop_on_signals(), stop_on_lost_workers():
             if sys.argv[1:2] and sys.argv[1] in COMMANDS:
                 # Files of one run must not change, but dzop watch waits for files that do.
                 with nullcontext() if sys.argv[1] == "watch" else track_files():
@@ -77,6 +77,9 @@ def main() -> None:
         message = _exit_message(error)
         if message is None:
             raise
+        if isinstance(error, WorkerLost):  # at exit, Python would wait for loky's thread, which waits for ever
+            print(message, file=sys.stderr, flush=True)
+            os._exit(1)
         sys.exit(message)
 
 
@@ -97,8 +100,8 @@ def _exit_message(error: BaseException) -> str | None:
     """The line to exit with; None for a bug, which keeps its traceback."""
     if isinstance(error, DzopError | HydraException | OmegaConfBaseException):
         return _format_error(error)
-    if isinstance(error, BrokenExecutor):
-        return f"error: a process of the sweep was killed, usually because memory ran out. {RESUME}"
+    if isinstance(error, BrokenExecutor | WorkerLost):
+        return f"error: a worker process was killed, usually because memory ran out. {RESUME}"
     if isinstance(error, OSError) and error.errno is not None:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"error: {where}{error.strerror}. {RESUME}"

@@ -128,7 +128,7 @@ def test_a_killed_worker_is_reported_in_one_line_and_a_rerun_resumes(command, st
     assert sweep.returncode == 1
     assert "Traceback" not in err
     # the workers' own watcher may print the last line
-    assert any(line.startswith("error: a process of the sweep was killed") for line in err.splitlines())
+    assert any(line.startswith("error: a worker process was killed") for line in err.splitlines())
     finished = len(list(rows.glob("*.json")))
     again = start(jobs)
     out, err = again.communicate(timeout=300)
