@@ -159,10 +159,8 @@ class PhotoConfig(Spec):
             needed = f"those of the photograph, {w} x {h} (width x height): register depth to colour first"
             raise BadInput(path, found=f"{found[1]} x {found[0]} pixels", needed=needed)
         if distorted:
-            found = (
-                "with dataset.distortion" if self.distortion is not None else "with a camera file that has distortion"
-            )
-            raise BadInput("dataset.depth", found=found, needed="an undistorted pair of images")
+            where = "dataset.distortion" if self.distortion is not None else "a camera file that has distortion"
+            raise BadInput("dataset.depth", found=f"with {where}", needed="an undistorted pair of images")
 
 
 def find_files(given: str | tuple[str, ...], where: str) -> tuple[Path, ...]:
