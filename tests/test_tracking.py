@@ -79,7 +79,7 @@ def test_a_prior_saves_the_search_of_templates(estimator, frames):
 def test_without_mask_the_object_is_sought_around_the_prior(estimator, frames):
     result = estimator(frames[1].rgb, K, prior=frames[0].T_cam_obj)
     assert off(result, frames[1])[0] < 6
-    with pytest.raises(BadInput, match="mask, bbox: found neither"):
+    with pytest.raises(BadInput, match="detect: found a search whose results nothing could verify"):
         estimator(frames[1].rgb, K, prior=replace(result, decision="reject"))
     with pytest.raises(BadInput, match="prior: found a pose outside the image"):
         estimator(frames[1].rgb, K, prior=rigid(np.eye(3), np.array([5000.0, 0, 500])))
