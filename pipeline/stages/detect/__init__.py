@@ -63,8 +63,8 @@ class SearchPlan(Spec):
     candidates: Positive = 30
     colour: NonNegativeFloat = 1.0
     nms_iou: Fraction = 0.6
-    enough: Fraction = 0.95
-    min_confidence: Fraction = 0.9
+    enough: Fraction = 0.98
+    min_confidence: Fraction = 0.95
     doubtful: Fraction = 0.0
 
 
