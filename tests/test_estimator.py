@@ -95,6 +95,9 @@ def test_a_depth_image_gives_the_distance(estimator, folder):
     K_long = K * [[1.03, 1, 1], [1, 1.03, 1], [1, 1, 1]]  # RGB alone places the object 3 % too far away
     without = estimator(rgb, K_long, mask=mask, name="mug")
     fitted = estimator(rgb, K_long, mask=mask, name="mug", depth_mm=depth_mm)
+    metres = estimator(rgb, K_long, mask=mask, name="mug", depth_mm=depth_mm / 1000)
+    assert any("depth_scale=1000 times the present one fits" in warning for warning in metres.warnings)
+    assert not any("depth" in warning for warning in fitted.warnings)
     assert without.T_cam_obj[2, 3] == pytest.approx(515, abs=4)
     assert fitted.T_cam_obj[2, 3] == pytest.approx(500, abs=4)
     with pytest.raises(BadInput, match=r"depth_mm: found shape \(3, 3\), needs that of the image, 240 x 320"):

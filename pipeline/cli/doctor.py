@@ -21,7 +21,13 @@ from pipeline.bop.symmetries import mesh_symmetries
 from pipeline.errors import DzopError
 from pipeline.functional.boxes import pixels_inside
 from pipeline.functional.camera_diagnosis import diagnose_camera
-from pipeline.functional.plausibility import diagnose_contrast, diagnose_distance, distance_text, estimate_distance
+from pipeline.functional.plausibility import (
+    diagnose_contrast,
+    diagnose_depth,
+    diagnose_distance,
+    distance_text,
+    estimate_distance,
+)
 from pipeline.functional.surface import signed_volume
 from pipeline.io.meshes import prepare_mesh
 from pipeline.items.objects import Mesh, MeshFacts
@@ -31,7 +37,6 @@ MANY_FACES, FEW_PIXELS, FAR_ORIGIN = 1_000_000, 1000, 1.5
 DARK, BRIGHT = 25.0, 235.0
 MOST_INSIDE = 0.9  # share of a box inside the image, below which it may be two corners
 FEWEST_MEASURED = 0.2  # share of an object's pixels with a depth
-FAR_OFF = 2.5  # ratio of measured depth and distance by size: occlusion and pose explain less
 
 
 @dataclass(frozen=True)
@@ -218,11 +223,10 @@ def _examine_depth(depth_mm: Float32[np.ndarray, " n"], distance_mm: float | Non
         return
     median_mm = float(np.median(depth_mm[depth_mm > 0]))
     text = f"a median of {median_mm / 1000:.3g} m on the object"
-    if distance_mm is None or 1 / FAR_OFF < median_mm / distance_mm < FAR_OFF:
+    remedy = "" if distance_mm is None else diagnose_depth(depth_mm[depth_mm > 0], distance_mm)
+    if distance_mm is None or not remedy:
         yield Finding("ok", "depth", text)
         return
-    fitting = [f for f in (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001) if 0.5 < f * median_mm / distance_mm < 2]
-    remedy = f"dataset.depth_scale={fitting[0]:g} times the present one fits" if fitting else "check K and the mask"
     yield Finding("warning", "depth", f"{text}, where mesh and K give {distance_mm / 1000:.3g} m", remedy)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 NEAR_MM, FAR_MM = 120.0, 10_000.0  # plausible distances of an object that a camera is pointed at
+FAR_OFF = 2.5  # ratio of measured depth and distance by size
 LEAST_RANGE, LEAST_DETAIL = 12.0, 1.5  # of 255 grey levels; on LM-O's and YCB-V's objects at least 24 and 4.5
 FLAT = 1e-3  # smallest over largest extent; below this, a mesh counts as a sheet
 _DETAIL_PX, _SIGMA_PX = 128, 4.0  # size at which detail is measured, and of what counts as detail
@@ -63,6 +64,22 @@ def distance_text(distance_mm: float, located_by: str) -> str:
 def estimate_distance(diameter_mm: float, focal_px: float, extent_px: float) -> float:
     """Distance (mm) at which an object of this diameter appears as large as its mask; it is nearer if occluded."""
     return focal_px * diameter_mm / extent_px
+
+
+def diagnose_depth(depth_mm: Float[np.ndarray, " n"], distance_mm: float) -> str:
+    """Why measured depths cannot be the object's, and the scale that would explain it; "" if they can.
+
+    ``depth_mm``: those known inside its mask or box. ``distance_mm``: by its size; occlusion and pose change it less.
+    """
+    if not len(depth_mm):
+        return ""
+    ratio = distance_mm / float(np.median(depth_mm))
+    if 1 / FAR_OFF < ratio < FAR_OFF:
+        return ""
+    fitting = [f for f in (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001) if 0.5 < ratio / f < 2]
+    if not fitting:
+        return "check K, the mask and the depth scale"
+    return f"dataset.depth_scale={fitting[0]:g} times the present one fits"
 
 
 def diagnose_shape(vertices: Float[np.ndarray, "v 3"]) -> str:

@@ -13,7 +13,13 @@ import numpy as np
 from pipeline.bop.masks import decode_rle, pixels_of
 from pipeline.errors import BadInput
 from pipeline.functional.camera_diagnosis import diagnose_camera
-from pipeline.functional.plausibility import diagnose_contrast, diagnose_distance, distance_text, estimate_distance
+from pipeline.functional.plausibility import (
+    diagnose_contrast,
+    diagnose_depth,
+    diagnose_distance,
+    distance_text,
+    estimate_distance,
+)
 from pipeline.graph.context import Context, ImageId
 from pipeline.items.features import CLASS_FACET_LAYER, PSEUDO_LAYERS, SALIENCY_LAYER
 from pipeline.items.objects import MeshFacts
@@ -108,11 +114,26 @@ def distance_warnings(
         x0, y0, x1, y1 = d.bbox_xyxy
         focal_px = float(context.K((d.scene_id, d.im_id))[0, 0])
         distance_mm = estimate_distance(facts_of(obj_id).diameter_mm, focal_px, float(np.hypot(x1 - x0, y1 - y0)))
+        where = f"{context.dataset.image_name(d.scene_id, d.im_id)}, {context.dataset.object_name(obj_id)}"
+        if problem := _check_depth(context, d, distance_mm):
+            warnings.append(f"{where}: {problem}")
         if problem := diagnose_distance(distance_mm):
             located_by = "box" if d.rle is None else "mask"
-            where = f"{context.dataset.image_name(d.scene_id, d.im_id)}, {context.dataset.object_name(obj_id)}"
             warnings.append(f"{where}: {distance_text(distance_mm, located_by)}: {problem}")
     return warnings
+
+
+def _check_depth(context: Context, d: Detection, distance_mm: float) -> str:
+    """Measured depths that are in another unit, or another place's."""
+    use = context.stages.depth.use
+    if use == "never" or not context.dataset.gives_depth:
+        return ""
+    depth_mm = context.dataset.depth_mm(d.scene_id, d.im_id)
+    inside = depth_mm[pixels_of(d.rle, d.bbox_xyxy, (depth_mm.shape[0], depth_mm.shape[1])) & (depth_mm > 0)]
+    if not (problem := diagnose_depth(inside, distance_mm)):
+        return ""
+    found = f"depth has a median of {float(np.median(inside)) / 1000:.3g} m there"
+    return f"{found}, where mesh and K give {distance_mm / 1000:.3g} m: {problem}"
 
 
 def _contrast_warnings(context: Context, detections: Sequence[Detection]) -> list[str]:

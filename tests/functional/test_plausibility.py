@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.functional.plausibility import diagnose_contrast, diagnose_distance, diagnose_shape, estimate_distance
+from pipeline.functional.plausibility import (
+    diagnose_contrast,
+    diagnose_depth,
+    diagnose_distance,
+    diagnose_shape,
+    estimate_distance,
+)
 
 SIZE_HW = (240, 320)
 MASK = np.zeros(SIZE_HW, bool)
@@ -73,6 +79,17 @@ def test_a_distance_that_no_photograph_is_taken_from_is_said_with_the_units_that
     problem = diagnose_distance(estimate_distance(diameter_mm, 600.0, 75.0))  # 100 mm are 800 mm away
     assert said in problem
     assert (problem == "") == (said == "")
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [(1.0, ""), (0.001, "=1000 times"), (0.1, "=10 times"), (10.0, "=0.1 times"), (4.0, "check K, the mask")],
+)
+def test_depth_of_another_scale_is_said_with_the_one_that_fits(scale, said):
+    problem = diagnose_depth(scale * np.linspace(780, 900, 50), 800.0)
+    assert said in problem
+    assert (problem == "") == (said == "")
+    assert diagnose_depth(np.zeros(0), 800.0) == ""
 
 
 def vertices_of(mesh: trimesh.Trimesh) -> np.ndarray:
