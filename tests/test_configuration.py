@@ -38,9 +38,20 @@ def loaded(path: Path) -> tuple[type, dict]:
             folder, field = group.split("@") if "@" in group else (group, group)
             inner = CONF / folder[1:] if folder.startswith("/") else path.parent / folder
             cls, fields_of = loaded(inner / f"{option}.yaml")
-            values[field] = build(cls, fields_of, where=field)
-    module, name = values.pop("_target_").rsplit(".", 1)
-    return getattr(importlib.import_module(module), name), values
+            *parents, last = field.split(".")
+            holder = values
+            for parent in parents:
+                holder = holder[parent]
+            holder[last] = build(cls, fields_of, where=field)
+    for field, value in values.items():
+        if isinstance(value, dict) and "_target_" in value:
+            values[field] = build(find_class(value.pop("_target_")), value, where=field)
+    return find_class(values.pop("_target_")), values
+
+
+def find_class(target: str) -> type:
+    module, name = target.rsplit(".", 1)
+    return getattr(importlib.import_module(module), name)
 
 
 @pytest.mark.parametrize("path", VARIANTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
