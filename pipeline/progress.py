@@ -20,6 +20,7 @@ STEPS = (
     "template encodings",
     "proposals",
     "proposal features",
+    "searches",
     "detections",
     "query crops",
     "query features",

@@ -94,6 +94,7 @@ def test_each_object_is_found_among_the_masks_and_read_back(scene, cache):
     found = detect(graph)
     assert {obj_id: overlap(d, graph) > 0.9 for obj_id, d in found.items()} == {1: True, 2: True}
     assert all(d.score >= plan.min_confidence and d.defect is None for d in found.values())
+    assert "searches" in graph.context.progress.table()
     again = graph_of(scene, cache, Search(plan=plan))
     assert detect(again) == found
     assert again.context.progress.counts["detections"].computed == 0
