@@ -21,6 +21,7 @@ from zarr.core.sync import sync
 from zarr.errors import BaseZarrError
 from zarr.storage import MemoryStore
 
+from pipeline.store.checksums import SEPARATOR
 from pipeline.store.completion import metadata_digest
 
 READ_ERRORS = (BaseZarrError, ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError, IsADirectoryError)
@@ -110,6 +111,7 @@ def _array_metadata(layout: Layout, rows: int) -> tuple[bytes, str]:
         dtype=layout.dtype,
         serializer=BytesCodec(endian="little") if np.dtype(layout.dtype).itemsize > 1 else BytesCodec(endian=None),
         compressors=([ZstdCodec(level=1)] if layout.compress else []) + [Crc32cCodec()],
+        chunk_key_encoding={"name": "default", "separator": SEPARATOR},
         config=_WRITE_ZEROS,
     )
     return read_bytes(store, "array/zarr.json") or b"", metadata_digest(array)

@@ -15,6 +15,7 @@ from zarr.abc.store import Store as ZarrStore
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
+SEPARATOR = "."  # in the names of chunks: an array has one folder. Older arrays have "/", and folders for each row
 CRC_BYTES = 4  # size of the crc32c at the end of a chunk
 
 RowChecksums = Mapping[int, bytes]
@@ -32,9 +33,9 @@ def from_hex(text: str, first: int = 0) -> dict[int, bytes]:
     return {first + i // CRC_BYTES: found[i : i + CRC_BYTES] for i in range(0, len(found), CRC_BYTES)}
 
 
-def chunk_key(array_path: str, ndim: int, row: int) -> str:
+def chunk_key(array_path: str, ndim: int, row: int, separator: str = SEPARATOR) -> str:
     """Key of a row's chunk in the store."""
-    return "/".join([array_path, "c", str(row), *["0"] * (ndim - 1)])
+    return f"{array_path}/{separator.join(['c', str(row), *['0'] * (ndim - 1)])}"
 
 
 def is_intact(chunk: bytes, checksum: bytes) -> bool:
@@ -71,22 +72,27 @@ class ChunkChecker(WrapperStore[ZarrStore]):
 
     def __init__(self, store: ZarrStore, array_path: str, checksums: RowChecksums | None) -> None:
         super().__init__(store)
-        self.prefix = f"{array_path}/c/"
+        self.array_path = array_path
         self.checksums = checksums
 
     def _with_store(self, store: ZarrStore) -> ChunkChecker:
-        return ChunkChecker(store, self.prefix.removesuffix("/c/"), self.checksums)
+        return ChunkChecker(store, self.array_path, self.checksums)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """See ZarrStore.get."""
         value = await self._store.get(key, prototype, byte_range)
-        if not key.startswith(self.prefix):
+        row = self._row(key)
+        if row is None:
             return value
         if value is None:
             raise FileNotFoundError(key)
-        if self.checksums is not None and self.checksums.get(self._row(key)) != _last_bytes(value):
+        if self.checksums is not None and self.checksums.get(row) != _last_bytes(value):
             raise ValueError("a chunk is not the one that was written for its row")
         return value
 
-    def _row(self, key: str) -> int:
-        return int(key.removeprefix(self.prefix).partition("/")[0])
+    def _row(self, key: str) -> int | None:
+        """Row of a chunk of this array; None for other keys."""
+        name = key.removeprefix(f"{self.array_path}/")
+        if name == key or name[:2] not in ("c.", "c/"):
+            return None
+        return int(name[2:].replace("/", ".").partition(".")[0])

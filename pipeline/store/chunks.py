@@ -25,25 +25,29 @@ from pipeline.store.checksums import CRC_BYTES, RowChecksums, chunk_key
 class ChunkFiles:
     """The chunks of one array on disk, one per row: little-endian bytes, compressed or not, followed by a crc32c.
 
-    ``path``: folder of the array. ``compressor``: None for raw bytes.
+    ``path``: folder of the array. ``compressor``: None for raw bytes. ``separator``: in the names of chunks.
     """
 
     path: str
     row: tuple[int, ...]
     dtype: np.dtype[Any]
     compressor: Zstd | None
+    separator: str
 
     @classmethod
     def of(cls, folder: Path | None, array: zarr.Array) -> ChunkFiles | None:
         """The chunks of an array below ``folder``; None if they are not on a local disk or in another format."""
-        codecs: Any = array.metadata.to_dict().get("codecs", ())
+        metadata: Any = array.metadata.to_dict()
+        codecs, encoding = metadata.get("codecs", ()), metadata.get("chunk_key_encoding", {})
         names = [codec["name"] for codec in codecs]
         one_chunk_per_row = array.chunks == (1, *array.shape[1:]) and bool(np.prod(array.shape))
         is_ours = one_chunk_per_row and names in (["bytes", "crc32c"], ["bytes", "zstd", "crc32c"])
+        is_ours = is_ours and encoding.get("name") == "default"
         if folder is None or not is_ours or array.dtype.newbyteorder("<") != array.dtype or not hasattr(os, "preadv"):
             return None
         compressor = Zstd(**codecs[1]["configuration"]) if "zstd" in names else None
-        return cls(str(folder / array.path), array.shape[1:], array.dtype, compressor)
+        separator = encoding["configuration"]["separator"]
+        return cls(str(folder / array.path), array.shape[1:], array.dtype, compressor, separator)
 
     def read(self, rows: Sequence[int], checksums: RowChecksums | None) -> np.ndarray:
         """Values of rows. Without ``checksums``, only the crc32c inside each chunk is checked.
@@ -64,7 +68,7 @@ class ChunkFiles:
         return {row: self._write_chunk(self._key(row), block[k]) for k, row in enumerate(rows)}
 
     def _key(self, row: int) -> str:
-        return chunk_key(self.path, 1 + len(self.row), row)
+        return chunk_key(self.path, 1 + len(self.row), row, self.separator)
 
     def _read_chunk(self, path: str, into: np.ndarray) -> bytes:
         """Read a chunk and check it; returns its checksum."""

@@ -85,7 +85,7 @@ def test_a_read_only_store_is_read_and_the_missing_entry_is_named(
     assert read_results(folder) == read_results(reference.single)
     disk.remount("rw")
     shutil.rmtree(disk.at / "cache" / "features")
-    (chunk,) = list((disk.at / "cache" / "crops").rglob("rgb/c/1/0/0/0"))[:1]
+    (chunk,) = list((disk.at / "cache" / "crops").rglob("rgb/c.1.0.0.0"))[:1]
     disk.remount("ro")
     ended = inputs.run(folder, "evaluate", "cluster.count=7", f"store.root={disk.at / 'cache'}")
     assert ended.status == 1
@@ -114,7 +114,7 @@ def test_a_wrong_clock_changes_nothing(inputs: Inputs, reference: Reference, fol
     reference.copy(folder, reference.single)
     shutil.rmtree(folder / "cache" / "poses")
     shutil.rmtree(folder / "cache" / "runs")
-    (chunk, *_) = list((folder / "cache" / "crops").rglob("rgb/c/1/0/0/0"))
+    (chunk, *_) = list((folder / "cache" / "crops").rglob("rgb/c.1.0.0.0"))
     chunk.unlink()
     then = datetime(year, 1, 1, tzinfo=UTC).timestamp()
     for path in folder.rglob("*"):

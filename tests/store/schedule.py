@@ -301,4 +301,4 @@ class Schedule:
     def files(self) -> list[str]:
         """Keys of chunks, and one time in four of metadata and journals too."""
         keys = [key for path in self.plain.entry_paths() for key in list_keys(self.plain.backend.zarr, path)]
-        return sorted(keys if self.rng.random() < 0.25 else [key for key in keys if "/c/" in key])
+        return sorted(keys if self.rng.random() < 0.25 else [key for key in keys if "/c." in key])

@@ -19,7 +19,7 @@ from tests.store.test_store import LAYOUT, REF, ROWS, compute, fill, values
 
 def chunk_key(s3) -> str:
     """Key of row 3 of the entry, in the folder that its completion record names."""
-    return f"cache/{REF.path}/{Store(s3.config()).read(REF).record['folder']}/maps/c/3/0/0"
+    return f"cache/{REF.path}/{Store(s3.config()).read(REF).record['folder']}/maps/c.3.0.0"
 
 
 def test_a_flipped_byte_and_a_missing_chunk_are_detected_and_repaired(s3):
@@ -134,7 +134,7 @@ def test_a_server_fault_leaves_the_entry_incomplete_and_the_next_run_completes_i
         server.status, written = status, []
 
         def after_five_chunks(command: str, path: str) -> bool:
-            written.extend([path] if command == "PUT" and "/maps/c/" in path else [])
+            written.extend([path] if command == "PUT" and "/maps/c." in path else [])
             return len(written) > 5
 
         server.faults = after_five_chunks
@@ -155,7 +155,7 @@ def test_a_fault_while_reading_is_not_taken_for_a_missing_entry(s3):
         for request in (lambda: store.is_complete(REF), lambda: store.read(REF)):
             with pytest.raises(StoreUnreachable):
                 request()
-        server.faults = lambda command, path: "/maps/c/" in path
+        server.faults = lambda command, path: "/maps/c." in path
         with pytest.raises(StoreUnreachable):
             store.read(REF).array("maps")
     assert Store(s3.config()).is_complete(REF)

@@ -127,7 +127,7 @@ def test_chunks_written_directly_are_those_that_zarr_writes(tmp_path: Path):
         for reader in (store, Store(LocalStoreConfig(root=str(folder)))):
             for name, expected in values.items():
                 assert np.array_equal(reader.read(ref).array(name, [3, 1]), expected[[3, 1]])
-        found.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("c/**/*") if path.is_file()})
+        found.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("c.*") if path.is_file()})
     assert len(found[0]) == 20
     assert found[0] == found[1]
 
@@ -159,7 +159,7 @@ def test_a_changed_layout_under_the_same_key_starts_from_scratch(store: Store):
 @pytest.mark.parametrize("position", [0, 11, -1])
 def test_a_flipped_byte_in_a_chunk_is_detected_and_repaired(local: Store, position: int):
     fill(local)
-    chunk = entry_folder(local) / "maps" / "c" / "3" / "0" / "0"
+    chunk = entry_folder(local) / "maps" / "c.3.0.0"
     damaged = bytearray(chunk.read_bytes())
     damaged[position] ^= 1
     chunk.write_bytes(damaged)
@@ -175,7 +175,7 @@ def test_a_flipped_byte_in_a_chunk_is_detected_and_repaired(local: Store, positi
 @pytest.mark.parametrize("keep", [0, 5])
 def test_a_truncated_chunk_is_detected(local: Store, keep: int):
     fill(local)
-    chunk = entry_folder(local) / "maps" / "c" / "9" / "0" / "0"
+    chunk = entry_folder(local) / "maps" / "c.9.0.0"
     chunk.write_bytes(chunk.read_bytes()[:keep])
     with pytest.raises(DamagedEntry):
         local.read(REF).array("maps", [9])
@@ -183,7 +183,7 @@ def test_a_truncated_chunk_is_detected(local: Store, keep: int):
 
 def test_a_missing_chunk_never_reads_as_zeros(local: Store):
     fill(local)
-    (entry_folder(local) / "maps" / "c" / "5" / "0" / "0").unlink()
+    (entry_folder(local) / "maps" / "c.5.0.0").unlink()
     with pytest.raises(DamagedEntry, match="lacks 1 of 10 chunks"):
         local.read(REF).array("maps", [5])
     fill(local)
@@ -219,7 +219,7 @@ def test_a_changed_document_makes_the_entry_a_miss(local: Store):
 def test_verify_reads_every_byte_and_gc_removes_only_incomplete_entries(local: Store):
     fill(local, refs=(REF, OTHER))
     assert verify(local) == {REF.path: "", OTHER.path: ""}
-    chunk = entry_folder(local) / "maps" / "c" / "1" / "0" / "0"
+    chunk = entry_folder(local) / "maps" / "c.1.0.0"
     chunk.write_bytes(b"x" * len(chunk.read_bytes()))
     assert "checksum" in verify(local)[REF.path]
     assert [entry.path for entry in collect_garbage(local, older_than_h=None, dry_run=True)] == [REF.path]

@@ -49,7 +49,7 @@ def another(store: Store) -> Store:
 
 
 def chunk(store: Store, name: str, row: int, ref=SOURCE) -> str:
-    (key,) = [k for k in list_keys(store.backend.zarr, ref.path) if f"/{name}/c/{row}" in k]
+    (key,) = [k for k in list_keys(store.backend.zarr, ref.path) if f"/{name}/c.{row}." in k]
     return key
 
 
@@ -58,7 +58,7 @@ def lose_one(store: Store, entry: Entry, name: str) -> None:
 
 
 def lose_array(store: Store, entry: Entry, name: str) -> None:
-    sync(store.backend.zarr.delete_dir(chunk(store, name, 3).partition("/c/")[0]))
+    sync(store.backend.zarr.delete_dir(chunk(store, name, 3).partition("/c.")[0]))
 
 
 def lose_entry(store: Store, entry: Entry, name: str) -> None:
