@@ -15,6 +15,7 @@ from presets import QUICK
 from test_configuration import VARIANTS, loaded
 
 from pipeline.bop.dataset import Dataset
+from pipeline.confidence.calibration import SHIPPED, read_calibration
 from pipeline.errors import BadInput
 from pipeline.graph import Context, Graph, ScoreNodes
 from pipeline.io.digests import track_files
@@ -52,7 +53,10 @@ class TinyRun:
         data, evaluate = self.open(), self.evaluate
         evaluate.check_theta_max()
         store = store or Store(MemoryStoreConfig())
-        graph = Graph(Context(self.stages, data, self.select.targets(data), store, self.runtime))
+        searches = self.stages.detect.search_plan is not None  # only a confidence verifies what a search finds
+        calibration = read_calibration(min(SHIPPED.glob("*.json"))) if searches else None
+        targets = self.select.targets(data)
+        graph = Graph(Context(self.stages, data, targets, store, self.runtime, calibration=calibration))
         graph.check()
         if not all(data.has_ground_truth(target.scene_id) for target in data.targets):
             return graph, None
