@@ -13,23 +13,23 @@ from pipeline.functional.rigid import rotation_between
 from pipeline.guesses import trace_guesses
 from pipeline.items.matches import TemplateMatch
 from pipeline.items.online import Hypothesis, Prior, Query, TemplateBank, Trace
-from pipeline.items.poses import PoseSolution
 from pipeline.method import Stages
 from pipeline.route import Route
 
 TRACKING_VERSION = 1
 """Raise it when a prior leads to other poses."""
-LOOKS = 2
-"""How often the object is rendered and matched. Once leaves half as much jitter again as a search of all templates."""
-NEAREST = 5
-"""A followed pose needs one of this many templates nearest to its view among those that match the query best."""
+NEAREST = 8
+"""A prior is followed along those of this many templates nearest to its view that the matcher finds without it."""
+TRIED = 4
+"""Most templates whose poses are solved; the best one is rendered. A search of all templates solves twice as many."""
 
 
 def trace_detection(stages: Stages, query: Query, bank: TemplateBank) -> Trace:
     """The trace of a detection: from its prior if there is one and the images confirm it, else from all templates.
 
-    A prior is confirmed if the pose that it leads to is convincing (Route.is_convincing) and its view is among those
-    that the matcher finds without the prior. Otherwise, the better score decides. Raises NoPose as trace_guesses.
+    A prior is confirmed if some of the templates near its view are among those that the matcher finds without it, and
+    the pose that they lead to is convincing (Route.is_convincing). Otherwise, the better score decides. Raises NoPose
+    as trace_guesses.
     """
     if query.prior is None:
         return trace_guesses(stages, query, bank)
@@ -52,22 +52,18 @@ class _Followed:
 
 
 def _follow(route: Route, prior: Prior) -> _Followed | None:
-    """Render the object in the expected pose and match, then again in the pose found; None if that fails."""
-    found = Hypothesis(0, 0.0, solution=PoseSolution(prior.T_cam_obj, np.zeros(0, dtype=bool), 0.0))
-    for _ in range(LOOKS):
-        found = route.rerender(found)
-    if found.rerendered is None or found.solution is None:
-        return None
+    """Solve from the matched templates near the prior's view, and render the best pose; None if that fails."""
     with route.clock("match"):
         match = route.stages.match(route.query, route.bank)
-    nearest = nearest_views(found.solution.T_cam_obj, prior.symmetries, route.bank.T_cam_obj, count=NEAREST)
-    ranks = [rank for rank, index in enumerate(match.index.tolist()) if index in nearest]
-    is_confirmed = bool(ranks) and route.is_convincing(found)
-    template_id, score = int(nearest[0]), 0.0
-    if ranks:
-        template_id, score = int(match.index[ranks[0]]), float(match.score[ranks[0]])
-    found = replace(found, template_id=template_id, template_score=score, score=route.score(found))
-    return _Followed(found, match, is_confirmed)
+    nearest = set(nearest_views(prior.T_cam_obj, prior.symmetries, route.bank.T_cam_obj, count=NEAREST).tolist())
+    matched = zip(match.index.tolist(), match.score.tolist(), strict=True)
+    near = [Hypothesis(index, score) for index, score in matched if index in nearest][:TRIED]
+    if not near:
+        return None
+    found = route.rerender(route.sort([route.solve(route.compare(hypothesis)) for hypothesis in near])[0])
+    if found.solution is None or found.rerendered is None:
+        return None
+    return _Followed(replace(found, score=route.score(found)), match, route.is_convincing(found))
 
 
 def nearest_views(
