@@ -104,14 +104,22 @@ class Frame(GivenObjects):
 def parse_image(rgb: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
     """An image as h x w x 3, uint8; a grey image gets three equal channels. Raises BadInput."""
     image = np.asarray(rgb)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+    if (
+        image.dtype != np.uint8
+        or not image.size
+        or image.ndim not in (2, 3)
+        or (image.ndim == 3 and image.shape[2] != 3)
+    ):
         raise BadInput("rgb", found=f"{image.dtype} of shape {image.shape}", needed="uint8 of shape (h, w, 3), in RGB")
     return np.repeat(image[..., None], 3, axis=-1) if image.ndim == 2 else image
 
 
 def parse_depth(depth_mm: np.ndarray, size_hw: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
     """A depth image in mm; NaN and infinity become 0, unknown. Raises BadInput for another shape or negative values."""
-    depth = np.nan_to_num(np.asarray(depth_mm, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    given = np.asarray(depth_mm)
+    if given.dtype.kind not in "uif":
+        raise BadInput("depth_mm", found=f"an array of {given.dtype}", needed="numbers of shape (h, w), in mm")
+    depth = np.nan_to_num(given.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     if depth.shape != size_hw:
         needed = f"that of the image, {size_hw[0]} x {size_hw[1]} (rows x columns): register depth to colour first"
         raise BadInput("depth_mm", found=f"shape {depth.shape}", needed=needed)
@@ -148,6 +156,11 @@ def parse_locations(given: Any, size_hw: tuple[int, int]) -> tuple[Location, ...
 
 def _parse_location(given: Any, size_hw: tuple[int, int], instance: str) -> Location:
     values = np.asarray(given)
+    if values.dtype.kind not in "buif":
+        found = f"an array of {values.dtype} and shape {values.shape}"
+        raise BadInput(
+            f"mask, bbox{instance}", found=found, needed="a mask (h, w), or a box [x,y,width,height] in pixels"
+        )
     if values.ndim == 1:
         numbers, where = [float(value) for value in values], f"bbox{instance}"
         check_box(numbers, size_hw, where)
