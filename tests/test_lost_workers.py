@@ -10,13 +10,14 @@ from pipeline.cli import termination
 from pipeline.cli.termination import WorkerLost, stop_on_lost_workers
 
 HALF_A_RESULT = """
-import gc, os, signal, struct, sys
+import gc, os, signal, struct, sys, time
 from joblib.externals.loky.process_executor import ProcessPoolExecutor
 from pipeline.__main__ import main
 from pipeline.cli import termination
 import pipeline.__main__
 
 def send_half():
+    time.sleep(1)  # the watch sees the worker alive first
     for queue in gc.get_objects():
         if type(queue).__name__ == "SimpleQueue" and hasattr(queue, "_writer"):
             os.write(queue._writer.fileno(), struct.pack("!i", 100) + b"half")

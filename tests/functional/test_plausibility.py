@@ -100,7 +100,7 @@ def vertices_of(mesh: trimesh.Trimesh) -> np.ndarray:
 FLAT = {
     "triangle": (np.array([[0.0, 0, 0], [100, 0, 0], [0, 60, 0]]), "flat (115 x 55.8 x 0 mm)"),
     "sheet": (vertices_of(trimesh.creation.box((100, 60, 0))), "flat (100 x 60 x 0 mm)"),
-    "disc": (vertices_of(trimesh.creation.cylinder(40, 0.01)), "flat (80 x 80 x 0.01 mm)"),
+    "disc": (vertices_of(trimesh.creation.cylinder(40, 0.01)), "flat ("),
     "foil": (vertices_of(trimesh.creation.box((100, 60, 0.02))), "flat (100 x 60 x 0.02 mm)"),
     "wire": (vertices_of(trimesh.creation.box((300, 0.1, 0.1))), "a line (300"),
 }
