@@ -20,6 +20,7 @@ from pipeline.spec import digest
 
 OURS, PAPER = "method=dzop", "method=dzop_paper"
 SWITCHES = (
+    "segment=none",
     "crop.padding_ratio=1.0",
     "fuse.normalise=false",
     "fuse.cells=all",
