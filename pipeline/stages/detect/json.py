@@ -24,6 +24,8 @@ from pipeline.stages.detect.annotated import image_paths
 
 DOUBTFUL = 0.5
 """Confidence of a pose below which ``search="doubtful"`` looks for the object elsewhere."""
+LIKELY = 0.5
+"""Confidence that a found pose needs: less than without a detector, which says that the object is in the image."""
 
 
 @spec
@@ -39,7 +41,8 @@ class Json(Detector):
     Entries that cannot be used (``defect`` says why) only fill up what usable ones leave open.
 
     ``search``: which targets are searched for in the whole photograph (see SearchPlan): none ("none"), those without a
-    usable detection ("missing"), or also those whose pose has a confidence below 0.5 ("doubtful").
+    usable detection ("missing"), or also those whose pose has a confidence below 0.5 ("doubtful"). What is found needs
+    a confidence of 0.5, and a higher one than the given detection's.
     """
 
     kind: ClassVar[str] = "detect.json"
@@ -60,7 +63,9 @@ class Json(Detector):
     @property
     def search_plan(self) -> SearchPlan | None:
         """As Detector.search_plan."""
-        return None if self.search == "none" else SearchPlan(doubtful=DOUBTFUL if self.search == "doubtful" else 0.0)
+        if self.search == "none":
+            return None
+        return SearchPlan(min_confidence=LIKELY, doubtful=DOUBTFUL if self.search == "doubtful" else 0.0)
 
     def recipe(self) -> dict[str, Any]:
         """As Spec.recipe, with the file's digest instead of its path."""
