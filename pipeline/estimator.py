@@ -9,6 +9,7 @@ result = estimator(rgb, K)  # slower: finds the object in the image first
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -60,6 +61,7 @@ class PoseEstimator:
         with self._open as opening:
             self._graph = self._onboard([Path(path).expanduser() for path in meshes.values()], settings, cache)
             self._open = opening.pop_all()
+        weakref.finalize(self, self._open.close)  # at exit, too, while the threads that renew leases still run
 
     @classmethod
     def from_mesh(

@@ -192,6 +192,21 @@ def test_settings_that_do_not_exist_are_refused(folder):
         PoseEstimator.from_mesh(folder / "mug.ply", settings=["match.tpo_k=3"])
 
 
+UNCLOSED = """
+import sys
+from pipeline import PoseEstimator
+
+estimator = PoseEstimator.from_mesh(sys.argv[1], settings=sys.argv[3:], cache=sys.argv[2])
+print(estimator.names)
+"""
+
+
+def test_a_program_that_does_not_close_its_estimator_ends(folder, estimator):
+    arguments = [str(folder / "mug.ply"), str(folder / "cache"), *SMALL]
+    ran = subprocess.run([sys.executable, "-c", UNCLOSED, *arguments], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stdout.splitlines()[-1:]) == (0, ["('mug',)"]), ran.stderr
+
+
 HEAVY = ("torch", "zarr", "scipy", "cv2", "diffusers", "hydra")
 LAZY = f"import sys, pipeline; print([name for name in {HEAVY} if name in sys.modules])"
 HELP = f"""
