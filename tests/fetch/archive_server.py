@@ -77,7 +77,7 @@ def _handler(server: ArchiveServer) -> type[BaseHTTPRequestHandler]:
             self.end_headers()
             if with_content:
                 end = min(len(content), start + server.breaks.pop(0)) if server.breaks else len(content)
+                server.sent[name] += end - start  # first, because the client may have all bytes before write returns
                 self.wfile.write(content[start:end])
-                server.sent[name] += end - start
 
     return Handler
