@@ -10,6 +10,7 @@ import pytest
 from command import run_dzop
 
 from benchmarks.video import make_video
+from pipeline.bop.photo import find_photograph
 from pipeline.cli import watch
 from pipeline.io.meshes import write_ply
 from pipeline.synthetic.objects import make_object
@@ -89,3 +90,9 @@ def test_a_file_that_stays_unreadable_is_one_line_and_the_others_go_on(taken, ca
 def test_what_cannot_be_watched_is_refused_at_once(taken, capsys, monkeypatch, more, message):
     ran = run_dzop(capsys, monkeypatch, *arguments(taken, *more))
     assert message in str(ran.err)
+
+
+def test_a_mask_belongs_to_the_photograph_with_the_longest_name_that_fits():
+    photos = [Path("shots", name) for name in ("a.png", "a_b.png", "ab.jpg")]
+    masks = ("a.png", "a_left.png", "a_b.png", "a_b_left.png", "ab_1.png", "b.png")
+    assert [find_photograph(Path("masks", name), photos) for name in masks] == ["a", "a", "a_b", "a_b", "ab", None]

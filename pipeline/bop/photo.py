@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -192,12 +193,17 @@ def _common_size(photos: tuple[Path, ...]) -> tuple[int, int]:
     return first
 
 
+def find_photograph(mask: Path, photos: Sequence[Path]) -> str | None:
+    """The longest stem of a photograph that a mask's name has, alone or before ``_...``; None if there is none."""
+    stems = [photo.stem for photo in photos if mask.stem == photo.stem or mask.stem.startswith(f"{photo.stem}_")]
+    return max(stems, key=len, default=None)
+
+
 def _pair_masks(masks: tuple[Path, ...], photos: tuple[Path, ...]) -> tuple[tuple[Path, ...], ...]:
     """The masks of every photograph: those whose names begin with its name. Raises BadInput."""
     if len(photos) == 1:
         return (masks,)
-    stems = sorted((photo.stem for photo in photos), key=len, reverse=True)
-    owner = {mask: next((s for s in stems if mask.stem == s or mask.stem.startswith(f"{s}_")), None) for mask in masks}
+    owner = {mask: find_photograph(mask, photos) for mask in masks}
     paired = tuple(tuple(mask for mask in masks if owner[mask] == photo.stem) for photo in photos)
     for photo, own in zip(photos, paired, strict=True):
         if not own:

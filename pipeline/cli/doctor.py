@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -260,5 +260,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--depth", help="a depth image registered to the photograph")
     add("--depth-scale", type=float, default=1.0, help="mm per unit of the depth image (default: 1)")
     add("--scale", type=float, default=1.0, help="multiplies the mesh: 1000 for metres (default: 1)")
-    add("--units", choices=("mm", "cm", "m", "inch", "auto"), default="mm", help="of the mesh (default: mm)")
+    add("--units", choices=get_args(Unit), default="mm", help="of the mesh (default: mm)")
     return parser

@@ -6,8 +6,9 @@ import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
-from pipeline.bop.given import MeshFiles
+from pipeline.bop.given import MeshFiles, Unit
 from pipeline.bop.symmetries import info_record, mesh_symmetries
 from pipeline.errors import BadInput
 from pipeline.functional.symmetry import Symmetries
@@ -47,6 +48,6 @@ def _parser() -> argparse.ArgumentParser:
     add("meshes", nargs="+", help="mesh files, in millimetres without --units")
     add("--out", help="models_info.json to write: diameter, bounding box and symmetries of each mesh")
     add("--geometry", action="store_true", help="write the symmetries of the shape, whatever the colours")
-    add("--units", choices=("mm", "cm", "m", "inch", "auto"), default="mm", help="of the meshes (default: mm)")
+    add("--units", choices=get_args(Unit), default="mm", help="of the meshes (default: mm)")
     add("--scale", type=float, default=1.0, help="multiplies the meshes, for any other unit (default: 1)")
     return parser

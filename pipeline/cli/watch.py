@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bop.photo import Photo
+from pipeline.bop.photo import Photo, find_photograph
 from pipeline.configuration import build_variant, compose_settings
 from pipeline.errors import BadInput, DzopError
 from pipeline.estimator import PoseEstimator
@@ -61,13 +61,12 @@ class Watcher:
     def step(self) -> bool:
         """Process every photograph that is complete; whether some are still waited for."""
         waiting = False
-        for path in sorted(self.folder.iterdir()):
-            if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
-                continue
+        photos = [path for path in sorted(self.folder.iterdir()) if _is_picture(path)]
+        for path in photos:
             stamp = _stamp(path)
             if self._settled.get(path) == stamp:
                 continue
-            masks = self._masks(path)
+            masks = self._masks(path, photos)
             if not self._is_still([path, *masks]) or (self.given["mask"] is not None and not masks):
                 waiting = True
                 continue
@@ -87,14 +86,13 @@ class Watcher:
                 still = False
         return still
 
-    def _masks(self, path: Path) -> list[Path]:
-        """The masks of a photograph: of its name, or of its name and ``_...``."""
+    def _masks(self, path: Path, photos: Sequence[Path]) -> list[Path]:
+        """The masks of a photograph, by name as with ``dataset=photo``. ``photos``: all in the folder."""
         if self.given["mask"] is None:
             return []
         folder = Path(self.given["mask"]).expanduser()
         files = sorted(folder.iterdir()) if folder.is_dir() else []
-        named = (file for file in files if file.stem == path.stem or file.stem.startswith(f"{path.stem}_"))
-        return [file for file in named if file.suffix.lower() in SUFFIXES and file != path]
+        return [f for f in files if f != path and _is_picture(f) and find_photograph(f, photos) == path.stem]
 
     def _process(self, path: Path, masks: Sequence[Path]) -> bool:
         """Estimate and write the poses of a photograph; False if it may still be incomplete."""
@@ -147,6 +145,10 @@ def _read_settings(settings: Sequence[str]) -> dict[str, Any]:
         found = "neither of mask and bbox" if given["mask"] is None else "mask and bbox"
         raise BadInput("dataset", found=found, needed="dataset.mask=FOLDER of masks, or dataset.bbox=[x,y,w,h]")
     return given
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def _stamp(path: Path) -> Stamp:

@@ -14,7 +14,7 @@ from pipeline.items.records import Answer
 from pipeline.outputs.folder import OutputFolder
 from pipeline.outputs.photo_files import LATEST, Cards, holds_results, link_latest, save_results
 from pipeline.outputs.pictures import Pictures
-from pipeline.outputs.pose_result import PoseResult, describe_doubt, result_of
+from pipeline.outputs.pose_result import PoseResult, confidence_warnings, result_of
 from pipeline.spec import digest
 
 FILES_VERSION = 3
@@ -88,7 +88,7 @@ class Photographs:
             if result.found:
                 lines.append(f"  {result.inliers} of {result.correspondences} matches agree{result.details()}")
             if isinstance(answer, PoseEstimate):
-                lines += [f"warning: {image}{doubt}" for doubt in describe_doubt(answer, result.name)]
+                lines += [f"warning: {image}{text}" for text in confidence_warnings(answer, result.name)]
         return "\n".join(lines)
 
     def _with_model(self, index: int) -> PoseResult:

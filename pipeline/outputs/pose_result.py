@@ -131,7 +131,7 @@ def result_of(
         confidence=answer.confidence,
         decision=answer.decision or None,
         alternatives=answer.alternatives,
-        warnings=(*warnings, *describe_doubt(answer, name)),
+        warnings=(*warnings, *confidence_warnings(answer, name)),
         inliers=answer.inliers,
         correspondences=answer.correspondences,
         reprojection_px=answer.reprojection_px,
@@ -142,7 +142,7 @@ def result_of(
     )
 
 
-def describe_doubt(estimate: PoseEstimate, name: str) -> tuple[str, ...]:
+def confidence_warnings(estimate: PoseEstimate, name: str) -> tuple[str, ...]:
     """One line for a pose that is not to be used as it is: what to check."""
     sure = "" if estimate.confidence is None else f" (confidence {estimate.confidence:.2f})"
     if estimate.decision == "check":

@@ -18,7 +18,7 @@ from pipeline.items.poses import Alternative, PoseEstimate
 from pipeline.items.views import Image
 from pipeline.outputs import photo_files
 from pipeline.outputs.photo_files import holds_results, link_latest, save_results
-from pipeline.outputs.pose_result import PoseResult, describe_doubt
+from pipeline.outputs.pose_result import PoseResult, confidence_warnings
 from pipeline.report.pose_page import MAX_BYTES, PosePage, ShownPose
 from pipeline.synthetic.objects import make_object
 
@@ -144,7 +144,7 @@ def estimate(**given) -> PoseEstimate:
     ],
 )
 def test_a_doubtful_pose_is_said_in_words(given, said):
-    lines = describe_doubt(estimate(**given), "mug")
+    lines = confidence_warnings(estimate(**given), "mug")
     assert len(lines) == len(said)
     assert all(line.startswith(text) for line, text in zip(lines, said, strict=True))
 
